@@ -1,0 +1,27 @@
+from snakemake.utils import min_version
+
+min_version("9.19")
+
+
+configfile: "config.yaml"
+
+
+report: "workflow/report/workflow.rst"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/data.smk"
+include: "workflow/rules/stage1.smk"
+include: "workflow/rules/priors.smk"
+include: "workflow/rules/stage2.smk"
+include: "workflow/rules/evaluate.smk"
+include: "workflow/rules/report.smk"
+include: "workflow/rules/pretraining.smk"
+
+
+rule all:
+    default_target: True
+    input:
+        RESULTS / "report.html",
+        expand(RESULTS / "tables" / "{table}.md", table=TABLES),
+        expand(RESULTS / "figures" / "{figure}.png", figure=FIGURES),

@@ -1,0 +1,3 @@
+from dine.cli import main
+
+main()

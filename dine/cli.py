@@ -1,0 +1,485 @@
+"""The command line: one command for each step, all of them usable without Snakemake."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from pathlib import Path
+
+import click
+
+from dine import __version__, config
+from dine.errors import ConfigError, DineError
+from dine.files import write_json, write_text
+
+# Heavy modules (torch, matplotlib) are imported by the command that needs them.
+
+IN = click.Path(exists=False, dir_okay=False, path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
+OUT = click.Path(path_type=Path)
+
+log = logging.getLogger("dine")
+
+
+class Settings(click.ParamType):
+    """A settings section: JSON text, or ``@file`` for a YAML or JSON file; checked on reading."""
+
+    name = "JSON|@FILE"
+
+    def __init__(self, model: type[config.Section]):
+        self.model = model
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, config.Section):
+            return value
+        if value.startswith("@"):
+            return config.validate_section(self.model, config.read_yaml(value[1:]), value[1:])
+        try:
+            values = json.loads(value)
+        except ValueError as error:
+            raise ConfigError(f"--settings is neither JSON nor @FILE: {error}.") from None
+        return config.validate_section(self.model, values, "--settings")
+
+
+def settings_option(model: type[config.Section]):
+    return click.option(
+        "--settings",
+        type=Settings(model),
+        default="{}",
+        show_default=True,
+        help=f"{model.__name__} settings; keys as in config.yaml, defaults where left out.",
+    )
+
+
+seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+name_option = click.option("--name", default="", help="Shown with the progress.")
+device_option = click.option(
+    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
+)
+batch_option = click.option(
+    "--batch-size", type=click.IntRange(1), default=4, show_default=True, help="Pairs at a time."
+)
+variants_option = click.option(
+    "--variant", "variants", type=IN, multiple=True, help="Corrupted targets; repeatable."
+)
+pairs_option = click.option("--pairs", type=IN, required=True, help="Pairs (HDF5).")
+model_option = click.option("--model", type=IN, required=True, help="Weights (safetensors).")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
+@click.version_option(__version__, prog_name="dine")
+@click.option("--log", "log_file", type=OUT, help="Also write the log to this file.")
+@click.option("--threads", type=click.IntRange(1), help="Threads for numerical work.")
+def cli(log_file: Path | None, threads: int | None):
+    """Non-rigid registration of point clouds with learned deformation priors."""
+    handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
+    if log_file is not None:
+        log_file.parent.mkdir(parents=True, exist_ok=True)
+        handlers.append(logging.FileHandler(log_file, encoding="utf-8"))
+    logging.basicConfig(
+        level=logging.INFO,
+        format="%(asctime)s %(message)s",
+        datefmt="%H:%M:%S",
+        handlers=handlers,
+        force=True,
+    )
+    if threads is not None:
+        # Before torch and its libraries start their thread pools.
+        os.environ["OMP_NUM_THREADS"] = str(threads)
+
+
+def _start_torch() -> None:
+    import torch
+
+    threads = os.environ.get("OMP_NUM_THREADS")
+    if threads:
+        torch.set_num_threads(int(threads))
+
+
+# --- configuration --------------------------------------------------------------------------------
+
+
+@cli.group("config")
+def config_group():
+    """Check and show configurations."""
+
+
+@config_group.command("check")
+@click.argument("files", nargs=-1, required=True, type=IN)
+def config_check(files: tuple[Path, ...]):
+    """Check configuration files; later ones are laid over earlier ones."""
+    config.load(*files)
+    click.echo("The configuration is valid.")
+
+
+@config_group.command("show")
+@click.argument("files", nargs=-1, required=True, type=IN)
+def config_show(files: tuple[Path, ...]):
+    """Print the complete configuration, defaults included, as YAML."""
+    import yaml
+
+    click.echo(yaml.safe_dump(config.load(*files).model_dump(), sort_keys=False), nl=False)
+
+
+@config_group.command("schema")
+def config_schema():
+    """Print the JSON schema of the configuration."""
+    click.echo(json.dumps(config.Config.model_json_schema(), indent=2))
+
+
+@config_group.command("write")
+@click.argument("settings", type=Settings(config.Config))
+@click.option("--out", type=OUT, required=True, help="YAML to write.")
+def config_write(settings: config.Config, out: Path):
+    """Write a complete configuration, given as JSON or @FILE, as YAML."""
+    import yaml
+
+    write_text(out, yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
+
+
+# --- data -----------------------------------------------------------------------------------------
+
+
+@cli.command()
+@click.argument("folder", type=FOLDER)
+def inspect(folder: Path):
+    """List what a folder of meshes holds, per condition and level, and what is left out and why.
+
+    Example: dine inspect ~/scans/liver
+    """
+    from dine.data.layout import scan
+
+    inventory = scan(folder)
+    if inventory.has_pairs:
+        click.echo(inventory.table().to_string(index=False))
+    else:
+        click.echo(f"{len(inventory.bases)} undeformed objects; targets would be made from them.")
+    if inventory.split_file:
+        click.echo(f"Split file: {inventory.split_file}")
+    for path, reason in inventory.left_out:
+        click.echo(f"left out: {path}: {reason}")
+
+
+@cli.command()
+@settings_option(config.Dataset)
+@click.option("--first-object", type=click.IntRange(0), default=0, help="First synthetic number.")
+@seed_option
+@click.option("--out", type=FOLDER, required=True, help="The dataset's results folder.")
+def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
+    """Make, find or download raw meshes.
+
+    Example: dine raw --settings '{"source": {"kind": "path", "folder": "scans"}}' --out results/mine
+    """
+    from dine.data.obtain import obtain
+
+    obtain(settings, out, seed=seed, first_object=first_object)
+
+
+@cli.command()
+@click.option("--raw", "raw_file", type=IN, required=True, help="raw.json of `dine raw`.")
+@settings_option(config.Pairs)
+@seed_option
+@click.option("--out", type=OUT, required=True, help="Pairs to write (HDF5).")
+def pairs(raw_file: Path, settings: config.Pairs, seed: int, out: Path):
+    """Turn raw meshes into index-consistent source/target pairs."""
+    from dine.data.prepare import prepare_pairs
+
+    prepare_pairs(raw_file, settings, seed=seed, out=out)
+
+
+@cli.command()
+@pairs_option
+@click.option("--condition", type=click.Choice(["noise", "outliers"]), required=True)
+@click.option("--level", type=float, required=True, help="Noise sigma, or outliers in percent.")
+@seed_option
+@click.option("--out", type=OUT, required=True, help="Variant to write (HDF5).")
+def corrupt(pairs: Path, condition: str, level: float, seed: int, out: Path):
+    """Draw corrupted targets for the test split."""
+    from dine.data.pairs import make_variant, read_pairs, write_variant
+
+    test = read_pairs(pairs, split="test")
+    write_variant(out, make_variant(test, condition, level, seed), test.checksum)
+
+
+@cli.command()
+@pairs_option
+@click.option("--out", type=OUT, required=True, help="Result (JSON).")
+@seed_option
+def agreement(pairs: Path, seed: int, out: Path):
+    """Measure how well the index convention holds across objects."""
+    from dine.data.prepare import measure_agreement
+
+    write_json(out, measure_agreement(pairs, seed=seed))
+
+
+# --- training -------------------------------------------------------------------------------------
+
+
+backbone_option = click.option(
+    "--backbone",
+    type=Settings(config.BackboneConfig),
+    default='{"kind": "robust_defreg"}',
+    show_default=True,
+    help="Kind and arguments of the backbone.",
+)
+
+
+@cli.command()
+@pairs_option
+@backbone_option
+@settings_option(config.Stage1)
+@seed_option
+@device_option
+@name_option
+@click.option("--out", type=FOLDER, required=True, help="Run folder.")
+def stage1(pairs, backbone, settings, seed, device, name, out):
+    """Train a backbone on the Chamfer distance alone.
+
+    Example: dine stage1 --pairs pairs.h5 --settings '{"steps": 1000}' --out runs/stage1
+    """
+    from dine.training import stages
+
+    _start_torch()
+    stages.stage1(
+        pairs,
+        backbone.kind,
+        backbone.arguments,
+        settings,
+        seed=seed,
+        out=out,
+        name=name or f"stage 1 {backbone.kind}",
+        device=device,
+    )
+
+
+@cli.command()
+@click.option("--pairs", type=IN, required=True, multiple=True, help="Pairs (HDF5); repeatable.")
+@backbone_option
+@settings_option(config.Pretraining)
+@seed_option
+@device_option
+@click.option("--out", type=FOLDER, required=True, help="Run folder.")
+def pretrain(pairs, backbone, settings, seed, device, out):
+    """Train weights to start Stage 1 from, on synthetic pairs with known displacement."""
+    from dine.training import stages
+
+    _start_torch()
+    stages.pretrain(
+        list(pairs),
+        backbone.kind,
+        backbone.arguments,
+        settings,
+        seed=seed,
+        out=out,
+        device=device,
+    )
+
+
+@cli.command()
+@model_option
+@pairs_option
+@batch_option
+@device_option
+@name_option
+@click.option("--out", type=OUT, required=True, help="Fields to write (HDF5).")
+def fields(model, pairs, batch_size, device, name, out):
+    """Write a model's displacement fields of the training split."""
+    from dine.training import stages
+
+    _start_torch()
+    stages.dump_fields(
+        model, pairs, out, name=name or "fields", batch_size=batch_size, device=device
+    )
+
+
+@cli.command("fit-prior")
+@click.option("--fields", type=IN, required=True, help="Fields of `dine fields` (HDF5).")
+@settings_option(config.PriorConfig)
+@seed_option
+@click.option("--out", type=OUT, required=True, help="Prior to write (safetensors).")
+def fit_prior(fields, settings, seed, out):
+    """Fit a deformation prior to displacement fields and freeze it.
+
+    Example: dine fit-prior --fields dvf.h5 --settings '{"kind": "pca"}' --out pca.safetensors
+    """
+    from dine.training import stages
+
+    _start_torch()
+    stages.fit_prior(fields, settings, seed=seed, out=out)
+
+
+prior_files_option = click.option(
+    "--prior", "priors", type=(str, IN), multiple=True, help="Name and file of a prior; repeatable."
+)
+stage2_option = click.option(
+    "--stage2", "stage2_settings", type=Settings(config.Stage2), default="{}", help="Stage 2."
+)
+
+
+@cli.command("search-lambda")
+@pairs_option
+@model_option
+@prior_files_option
+@stage2_option
+@settings_option(config.LambdaSearch)
+@seed_option
+@device_option
+@click.option("--out", type=OUT, required=True, help="Result (JSON).")
+def search_lambda(pairs, model, priors, stage2_settings, settings, seed, device, out):
+    """Choose λ on validation pairs."""
+    from dine.training import stages
+
+    _start_torch()
+    stages.search_lambda(
+        pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, device=device
+    )
+
+
+@cli.command()
+@pairs_option
+@model_option
+@click.option("--variant", default=config.CONTROL, show_default=True, help="Prior's name.")
+@click.option("--prior", type=IN, help="Prior's file; none for the control.")
+@click.option("--lambda", "weight", help="A number, or the file of `dine search-lambda`.")
+@settings_option(config.Stage2)
+@seed_option
+@device_option
+@name_option
+@click.option("--out", type=FOLDER, required=True, help="Run folder.")
+def stage2(pairs, model, variant, prior, weight, settings, seed, device, name, out):
+    """Refine a Stage-1 model with λ times a frozen prior; without a prior, the λ = 0 control."""
+    from dine.training import stages
+
+    _start_torch()
+    if prior is None:
+        value = 0.0
+    elif weight is None:
+        raise ConfigError("--lambda is needed with a prior: a number or a file of search-lambda.")
+    else:
+        try:
+            value = float(weight)
+        except ValueError:
+            value = stages.selected_lambda(Path(weight), variant)
+    stages.stage2(
+        pairs,
+        model,
+        settings,
+        variant=variant,
+        prior=prior,
+        weight=value,
+        seed=seed,
+        out=out,
+        name=name or f"stage 2 {variant}",
+        device=device,
+    )
+
+
+# --- evaluation and reporting ---------------------------------------------------------------------
+
+
+@cli.command()
+@model_option
+@pairs_option
+@variants_option
+@batch_option
+@device_option
+@name_option
+@click.option("--out", type=OUT, required=True, help="Predictions to write (HDF5).")
+def predict(model, pairs, variants, batch_size, device, name, out):
+    """Register the test split and its corrupted variants; write the displacement fields."""
+    from dine.evaluation.predict import predict as run
+
+    _start_torch()
+    run(
+        model,
+        pairs,
+        list(variants),
+        out,
+        name=name or "predict",
+        batch_size=batch_size,
+        device=device,
+    )
+
+
+@cli.command()
+@click.option("--predictions", type=IN, required=True)
+@pairs_option
+@variants_option
+@click.option("--dataset", required=True)
+@click.option("--backbone", required=True)
+@click.option("--method", required=True)
+@click.option("--point-errors", type=OUT, required=True, help="Per-point errors (HDF5).")
+@click.option("--out", type=OUT, required=True, help="Metrics (CSV).")
+def evaluate(predictions, pairs, variants, dataset, backbone, method, point_errors, out):
+    """Compute metrics from stored predictions."""
+    from dine.evaluation.metrics import evaluate as run
+
+    run(
+        predictions,
+        pairs,
+        list(variants),
+        out,
+        point_errors,
+        dataset=dataset,
+        backbone=backbone,
+        method=method,
+    )
+
+
+@cli.command()
+@click.argument("metrics", nargs=-1, required=True, type=IN)
+@click.option("--out", type=FOLDER, required=True, help="Folder for CSV, Markdown and LaTeX.")
+def tables(metrics, out):
+    """Aggregate metrics into the paper's tables and their companions."""
+    from dine.reporting.tables import all_tables, load_metrics, to_markdown, write_table
+
+    made = all_tables(load_metrics(metrics))
+    for table in made:
+        write_table(table, out / table.name)
+    write_text(out / "all.md", "\n\n".join(to_markdown(table) for table in made))
+
+
+@cli.command()
+@click.option("--results", type=FOLDER, required=True, help="The workflow's results folder.")
+@settings_option(config.Config)
+@click.option("--out", type=FOLDER, required=True, help="Folder for PNG and PDF.")
+def figures(results, settings, out):
+    """Draw all figures of a finished run."""
+    from dine.reporting.build import draw_figures
+
+    draw_figures(results, settings, out)
+
+
+@cli.command()
+@click.option("--results", type=FOLDER, required=True, help="The workflow's results folder.")
+@settings_option(config.Config)
+@click.option("--out", type=OUT, required=True, help="Report to write (HTML).")
+def report(results, settings, out):
+    """Write one self-contained HTML page with tables, figures and findings."""
+    from dine.reporting.build import build_report
+
+    build_report(results, settings, out)
+
+
+def main() -> None:
+    """Entry point: user errors become one line on standard error."""
+    try:
+        cli(standalone_mode=False)
+    except click.exceptions.Abort:
+        sys.exit(130)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except DineError as error:
+        # Also reaches the log file; before the command line is parsed there is none yet.
+        if logging.getLogger().handlers:
+            log.error("Error: %s", error)
+        else:
+            click.echo(f"Error: {error}", err=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,394 @@
+"""The configuration: one typed source, checked before anything runs.
+
+Importing this module is cheap (no torch), since Snakemake does it for every DAG.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from dine.errors import ConfigError
+
+CONTROL = "lambda0"
+"""Stage 2 without a prior: same start, same steps, same seed."""
+
+STAGE1 = "stage1"
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
+
+
+def _no_bool(value: Any) -> Any:
+    # YAML reads `off` and `yes` as booleans, which pydantic would take for 0 and 1.
+    if isinstance(value, bool):
+        raise ValueError(f"expected a number, found {value}")
+    if isinstance(value, str):
+        raise ValueError(
+            f"expected a number, found the text {value!r} (YAML wants 1.0e-4, not 1e-4)"
+        )
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_no_bool)]
+Count = Annotated[int, BeforeValidator(_no_bool), Field(ge=1)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Fraction = Annotated[Number, Field(ge=0, le=1)]
+
+
+class Section(BaseModel):
+    """Base of all sections: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class Source(Section):
+    kind: Literal["synthetic", "path", "doi"] = "synthetic"
+    """Where raw meshes come from: generated, a folder of yours, or the published dataset."""
+    folder: str | None = None
+    """For `path`: the published layout, or undeformed meshes from which targets are made."""
+    doi: str | None = None
+    """For `doi`: the dataset's DOI."""
+    server: str = "https://heidata.uni-heidelberg.de"
+    """For `doi`: the Dataverse server."""
+    version: str = "1.0"
+    """For `doi`: the dataset's version."""
+
+    @model_validator(mode="after")
+    def _complete(self):
+        if self.kind == "path" and not self.folder:
+            raise ValueError("`folder` is needed when `kind` is path")
+        if self.kind == "doi" and not self.doi:
+            raise ValueError("`doi` is needed when `kind` is doi")
+        return self
+
+
+class Recipe(Section):
+    """How deformed targets are made, for `synthetic` and for `path` with undeformed meshes."""
+
+    shape: Literal["primitives", "tissue"] = "primitives"
+    """Synthetic base objects: SynBench-like primitives or DeformedTissue-like 2.5D patches."""
+    objects: Count = 36
+    """Number of synthetic base objects."""
+    levels: list[Positive] = Field(default=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8], min_length=1)
+    """Deformation levels."""
+    control_percents: list[Positive] = Field(default=[2.0, 5.0, 10.0], min_length=1)
+    """Shares of control points, in percent of the sampled points."""
+    widths: list[Positive] = Field(default=[0.3, 0.4, 0.5], min_length=1)
+    """Widths of the Gaussian radial basis function, on objects of unit radius."""
+    amplitude: Positive = 0.25
+    """Standard deviation per coordinate of a control displacement at level 1."""
+    pairs_per_level: Count = 1
+    """Targets per object and level."""
+
+    @model_validator(mode="after")
+    def _combinations(self):
+        combinations = len(self.control_percents) * len(self.widths)
+        if self.pairs_per_level > combinations:
+            raise ValueError(
+                f"`pairs_per_level` is {self.pairs_per_level}, but `control_percents` × `widths` "
+                f"gives only {combinations} different deformations"
+            )
+        return self
+
+
+class Split(Section):
+    """Shares of base objects; a published split file takes precedence."""
+
+    train: Fraction = 0.7
+    """Share of objects to train on."""
+    val: Fraction = 0.1
+    """Share of objects for the search of λ."""
+    test: Fraction = 0.2
+    """Share of objects for the tables."""
+
+    @model_validator(mode="after")
+    def _sum(self):
+        total = self.train + self.val + self.test
+        if abs(total - 1) > 1e-6 or min(self.train, self.val, self.test) <= 0:
+            raise ValueError(
+                f"train, val and test must be positive and add up to 1, found {total:g}"
+            )
+        return self
+
+
+class Pairs(Section):
+    points: Annotated[Count, Field(ge=16)] = 1024
+    """Points per cloud."""
+    convention: Literal["sphere", "disc", "lexicographic", "none"] = "sphere"
+    """What index i means across objects; see docs/pairs.md."""
+    split: Split = Split()
+
+
+class Corruption(Section):
+    """Corrupted targets for the test split; the levels of the paper's Table 3 by default."""
+
+    noise: list[Positive] = [0.01, 0.03, 0.04]
+    """Standard deviations of Gaussian noise, in the normalised frame."""
+    outliers: list[Positive] = [5.0, 25.0, 45.0]
+    """Outliers in percent of the points."""
+
+
+class Dataset(Section):
+    source: Source = Source()
+    recipe: Recipe = Recipe()
+    pairs: Pairs = Pairs()
+    corruption: Corruption = Corruption()
+
+
+class BackboneConfig(Section):
+    kind: str = "robust_defreg"
+    """A built-in backbone or an import path `package.module:Class`."""
+    arguments: dict[str, Any] = {}
+    """Keyword arguments of the class."""
+    priors: list[str] = ["pca"]
+    """Priors whose Stage 2 is trained with this backbone."""
+
+
+class PriorConfig(Section):
+    kind: str = "pca"
+    """A built-in prior or an import path `package.module:Class`."""
+    arguments: dict[str, Any] = {}
+    """Keyword arguments of the class's `fit`."""
+
+
+class PCAArguments(Section):
+    components: Count = 64
+    """Principal components n_c; reduced, with a note, when there are fewer samples."""
+    shrinkage: Fraction = 0.05
+    """Shrinkage of the latent covariance towards a scaled identity."""
+    epsilon_std: Positive = 1.0e-6
+    """ε_σ, added to the coordinate-wise standard deviation."""
+    epsilon_covariance: Positive = 1.0e-3
+    """ε_Σ, added to the diagonal of the latent covariance."""
+
+
+class FlowArguments(Section):
+    transforms: Count = 6
+    """RealNVP coupling layers."""
+    hidden: Count = 256
+    """Width of the hidden layers of each coupling."""
+    steps: Count = 600
+    """Optimiser steps of the maximum-likelihood fit."""
+    batch_size: Count = 2048
+    """Displacement vectors per step."""
+    learning_rate: Positive = 1.0e-3
+
+
+class Training(Section):
+    """What every training shares."""
+
+    data_term: str = "chamfer"
+    """Data term: `chamfer`, `l1` (needs the true displacement) or an import path."""
+    steps: Count = 480
+    """Optimiser steps."""
+    batch_size: Count = 1
+    """Pairs per step."""
+    learning_rate: Positive = 1.0e-3
+    schedule: Literal["constant", "cosine"] = "constant"
+    """Learning rate over the steps; `cosine` falls to a hundredth."""
+    weight_decay: NonNegative = 0.01
+    """AdamW's decoupled weight decay."""
+    clip: Positive = 1.0
+    """Largest norm of the gradient."""
+    validate_every: Count = 120
+    """Steps between validations on `validation_pairs`."""
+    validation_pairs: Count = 16
+    """Validation pairs, spread evenly over the split."""
+    save_seconds: Positive = 20.0
+    """Longest time between two saved training states."""
+
+
+class Stage1(Training):
+    start: str = "random"
+    """`random` (the paper), `pretrained` (the shipped weights) or a file of weights."""
+
+
+class Stage2(Training):
+    steps: Count = 240
+    """Optimiser steps."""
+
+
+class LambdaSearch(Section):
+    dataset: str = "synbench"
+    """Dataset whose validation split decides."""
+    backbone: str = "robust_defreg"
+    """Backbone that decides."""
+    priors: list[str] = Field(default=["pca"], min_length=1)
+    """Priors with a λ of their own; the others use the first one's."""
+    candidates: list[Positive] = Field(default=[1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3], min_length=1)
+    """Values of λ to try; λ = 0 is always tried too, for comparison."""
+    steps: Count = 120
+    """Stage-2 steps per candidate."""
+    validation_pairs: Count = 32
+    """Validation pairs on which the candidates are compared."""
+
+
+class Evaluation(Section):
+    batch_size: Count = 4
+    """Pairs per forward pass."""
+    qualitative_level: Positive = 0.6
+    """Level nearest to which the pair in the qualitative figure is chosen."""
+
+
+class Pretraining(Training):
+    """Weights of our own to start from: L1 on true displacements of synthetic pairs."""
+
+    data_term: str = "l1"
+    steps: Count = 4000
+    schedule: Literal["constant", "cosine"] = "cosine"
+    objects: Count = 120
+    """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
+
+
+class Config(Section):
+    """The whole configuration."""
+
+    results: str = "results"
+    """Folder of all outputs."""
+    seed: Annotated[int, BeforeValidator(_no_bool), Field(ge=0, lt=2**31)] = 0
+    """Seed of data, initial weights and training order."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """`auto` takes a CUDA device where there is one."""
+    threads: Count = 1
+    """Threads of each training or prediction; Snakemake's -j shares them out."""
+    datasets: dict[str, Dataset] = Field(default={}, min_length=1)
+    backbones: dict[str, BackboneConfig] = Field(default={}, min_length=1)
+    priors: dict[str, PriorConfig] = Field(default={}, min_length=1)
+    stage1: Stage1 = Stage1()
+    stage2: Stage2 = Stage2()
+    lambda_search: LambdaSearch = LambdaSearch()
+    evaluation: Evaluation = Evaluation()
+    pretraining: Pretraining = Pretraining()
+
+    @model_validator(mode="after")
+    def _references(self):
+        for section in ("datasets", "backbones", "priors"):
+            for name in getattr(self, section):
+                if not _NAME.match(name):
+                    raise ValueError(
+                        f"the name {name!r} under `{section}` must be lower-case letters, digits "
+                        "and underscores, starting with a letter"
+                    )
+        for name in (STAGE1, CONTROL):
+            if name in self.priors:
+                raise ValueError(f"a prior cannot be called {name!r}; that name is taken")
+        for backbone, settings in self.backbones.items():
+            for prior in settings.priors:
+                self._known("priors", prior, f"backbones.{backbone}.priors")
+        search = self.lambda_search
+        self._known("datasets", search.dataset, "lambda_search.dataset")
+        self._known("backbones", search.backbone, "lambda_search.backbone")
+        for prior in search.priors:
+            self._known("priors", prior, "lambda_search.priors")
+        for name, prior in self.priors.items():
+            check_arguments(prior, f"priors.{name}.arguments")
+        return self
+
+    def _known(self, section: str, name: str, where: str) -> None:
+        known = getattr(self, section)
+        if name not in known:
+            raise ValueError(
+                f"`{where}` names {name!r}, which is not under `{section}` "
+                f"(there: {', '.join(known)})"
+            )
+
+    def methods(self, backbone: str) -> list[str]:
+        """What is evaluated for a backbone: Stage 1, the control, then its priors."""
+        return [STAGE1, CONTROL, *self.backbones[backbone].priors]
+
+
+PRIOR_ARGUMENTS: dict[str, type[Section]] = {"pca": PCAArguments, "flow": FlowArguments}
+
+
+def check_arguments(prior: PriorConfig, where: str = "arguments") -> dict[str, Any]:
+    """Complete arguments of a prior: defaults filled in for the built-in kinds."""
+    model = PRIOR_ARGUMENTS.get(prior.kind)
+    if model is None:
+        if ":" not in prior.kind:
+            raise ValueError(
+                f"`{where.removesuffix('.arguments')}.kind` is {prior.kind!r}; expected one of "
+                f"{', '.join(PRIOR_ARGUMENTS)} or an import path 'package.module:Class'"
+            )
+        return dict(prior.arguments)
+    try:
+        return model.model_validate(prior.arguments).model_dump()
+    except ValidationError as error:
+        raise ValueError(explain(error, where)) from None
+
+
+def explain(error: ValidationError, where: str = "") -> str:
+    """One line for each fault of a configuration: key, value, what was expected."""
+    lines = []
+    for fault in error.errors():
+        key = ".".join([where, *map(str, fault["loc"])] if where else map(str, fault["loc"]))
+        value = fault["input"]
+        if fault["type"] == "extra_forbidden":
+            lines.append(f"`{key}` is not a known key (value {value!r}); check the spelling")
+        elif fault["type"] == "missing":
+            lines.append(f"`{key}` is missing")
+        elif fault["type"] == "value_error":
+            text = str(fault["ctx"]["error"])
+            lines.append(f"`{key}`: {text}" if key else text)
+        else:
+            lines.append(f"`{key}` is {value!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
+    return "; ".join(lines)
+
+
+def validate(values: Any, where: str = "the configuration") -> Config:
+    """Check a mapping and fill in defaults.
+
+    Raises:
+        ConfigError: every fault, with key, value and what was expected.
+    """
+    return validate_section(Config, values, where)
+
+
+def validate_section(model: type[Section], values: Any, where: str):
+    """Check one section, such as a command's settings, against its model."""
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: expected keys and values, found {type(values).__name__}.")
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{where}: {explain(error)}.") from None
+
+
+def read_yaml(path: str | Path) -> dict[str, Any]:
+    """A YAML file's mapping, read without running any code.
+
+    Raises:
+        ConfigError: missing, unreadable, or not a mapping.
+    """
+    try:
+        values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}.") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: expected keys and values, found {type(values).__name__}.")
+    return values
+
+
+def merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """``base`` with ``changes`` laid over it, section by section, as Snakemake does."""
+    merged = dict(base)
+    for key, value in changes.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict):
+            merged[key] = merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def load(*paths: str | Path) -> Config:
+    """Read configuration files, later ones laid over earlier ones, and check the result."""
+    values: dict[str, Any] = {}
+    for path in paths:
+        values = merge(values, read_yaml(path))
+    return validate(values, " + ".join(map(str, paths)))

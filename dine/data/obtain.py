@@ -1,0 +1,89 @@
+"""Raw meshes of a dataset, from whichever source the configuration names."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pandas as pd
+
+from dine.config import Dataset
+from dine.data.layout import Inventory, scan
+from dine.data.raw import deform_bases, synthesise
+from dine.errors import DataError
+from dine.files import atomic_path, read_json, write_json
+
+log = logging.getLogger(__name__)
+
+# How data came about, as tables and figures name it.
+SYNTHETIC, BASES, PATH, DOI = "synthetic", "bases", "path", "doi"
+
+
+def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) -> None:
+    """Make or find a dataset's raw files.
+
+    Writes into ``folder``: ``raw.json`` (where the files are and how they came about),
+    ``inventory.csv`` (pairs and objects per condition and level), ``left_out.csv`` (every file that
+    is not used, and why), and, where files are made or downloaded, ``raw/`` with them.
+
+    Args:
+        dataset: source and recipe.
+        folder: the dataset's results folder.
+        seed: of generated objects and deformations.
+        first_object: number of the first synthetic object, to keep datasets apart.
+
+    Raises:
+        DataError: nothing usable was found.
+        DownloadError: the download failed.
+    """
+    source = dataset.source
+    made = folder / "raw"
+    recipe = dataset.recipe.model_dump(exclude={"shape", "objects"})
+    recipe |= {"points": dataset.pairs.points, "seed": seed}
+    if source.kind == "synthetic":
+        synthesise(made, dataset.recipe.shape, dataset.recipe.objects, first_object, **recipe)
+        place, origin = made, SYNTHETIC
+    elif source.kind == "path":
+        place, origin = Path(source.folder).expanduser(), PATH
+        inventory = scan(place)
+        if not inventory.has_pairs:
+            log.info("%s holds undeformed objects only; making deformed targets", place)
+            deform_bases(made, inventory, **recipe)
+            place, origin = made, BASES
+    else:
+        # Imported here, since only this source needs the network.
+        from dine.data.dataverse import download
+
+        download(source.doi, made, source.server, source.version)
+        place, origin = made, DOI
+    inventory = scan(place)
+    if not inventory.has_pairs:
+        raise DataError(
+            f"{place} holds no Source_/Target_ pairs; expected the published layout "
+            "(Deformation_Level/<level>/Source_… and Target_…)."
+        )
+    report(inventory, folder)
+    write_json(folder / "raw.json", {"folder": str(place), "origin": origin})
+
+
+def report(inventory: Inventory, folder: Path) -> None:
+    """Write what was found and what was left out as CSV."""
+    with atomic_path(folder / "inventory.csv") as temporary:
+        inventory.table().to_csv(temporary, index=False)
+    left_out = pd.DataFrame(
+        [(str(path), reason) for path, reason in inventory.left_out], columns=["file", "reason"]
+    )
+    with atomic_path(folder / "left_out.csv") as temporary:
+        left_out.to_csv(temporary, index=False)
+    log.info(
+        "%d pairs found, %d files left out (listed in %s)",
+        len(inventory.pairs),
+        len(inventory.left_out),
+        folder / "left_out.csv",
+    )
+
+
+def obtained(raw: Path) -> tuple[Inventory, str]:
+    """The files behind a ``raw.json`` and their origin."""
+    facts = read_json(raw)
+    return scan(facts["folder"]), facts["origin"]

@@ -1,0 +1,385 @@
+"""Raw folders in the layout of the published datasets, made from undeformed objects.
+
+    <folder>/README.txt                                   what this is, in plain words
+    <folder>/provenance.json                              parameters, objects, what was left out
+    <folder>/Data/<object>.ply                            undeformed objects
+    <folder>/Deformation_Level/<level>/Source_<object>_<a>_<b>.ply
+    <folder>/Deformation_Level/<level>/Target_<object>_<a>_<b>.ply
+
+<a> is the percentage of control points, <b> the width of the Gaussian. Only the target is
+deformed: same vertices and faces, same order, moved.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import logging
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from filelock import FileLock
+
+from dine import __version__
+from dine.data.deformation import check_recipe, rbf_displacement
+from dine.data.layout import Inventory
+from dine.data.readers import read_surface, write_surface
+from dine.data.surface import Surface
+from dine.data.synthetic import primitive, tissue_patch
+from dine.errors import DataError, StorageError
+from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
+
+logger = logging.getLogger(__name__)
+
+SYNTHETIC = "synthetic"
+"""``origin`` of folders whose undeformed objects are synthetic too."""
+
+_MAKER = "dine.data.raw"
+_GENERATORS = {"primitives": primitive, "tissue": tissue_patch}
+_Named = tuple[str, Callable[[], Surface]]
+
+
+def write_dataset(
+    folder: str | os.PathLike,
+    bases: Iterable[tuple[str, Surface]],
+    *,
+    levels: Sequence[float],
+    control_percents: Sequence[float],
+    widths: Sequence[float],
+    amplitude: float,
+    points: int,
+    pairs_per_level: int,
+    seed: int,
+    origin: str,
+) -> None:
+    """Deform every object at every level and write the folder described at the top.
+
+    Every object gets ``pairs_per_level`` targets per level, each with its own (a, b) drawn without
+    repetition from ``control_percents`` x ``widths``. The random numbers of a pair follow from
+    (seed, object, level, number of the pair) alone: adding objects, levels or pairs changes no
+    other file.
+
+    The folder appears under its name only when it is complete. One that is there already is kept
+    as it is if it was made from equal input, and otherwise replaced once the new one is complete.
+
+    Args:
+        folder: where to write.
+        bases: (name, undeformed surface in any unit). Characters in a name that are unsafe in
+            file names are replaced by '-'.
+        levels: deformation levels, > 0.
+        control_percents: percentages of control points, in (0, 100].
+        widths: widths of the Gaussian in object radii, > 0.
+        amplitude: see ``rbf_displacement``.
+        points: points per cloud, which the percentages refer to.
+        pairs_per_level: targets per object and level.
+        seed: seed of the dataset.
+        origin: ``SYNTHETIC``, or the path that real base objects come from.
+
+    Raises:
+        ValueError: a parameter outside its range, or repeated.
+        DataError: no object is usable (a single unusable one is left out, with a warning and its
+            reason in provenance.json), or ``folder`` holds something that DINE did not make.
+        StorageError: the folder cannot be written.
+    """
+    surfaces = list(bases)
+    _write(
+        folder,
+        [(name, partial(_given, surface)) for name, surface in surfaces],
+        identity=[[name, _fingerprint(surface)] for name, surface in surfaces],
+        levels=levels,
+        control_percents=control_percents,
+        widths=widths,
+        amplitude=amplitude,
+        points=points,
+        pairs_per_level=pairs_per_level,
+        seed=seed,
+        origin=origin,
+    )
+
+
+def synthesise(
+    folder: str | os.PathLike,
+    kind: Literal["primitives", "tissue"],
+    objects: int,
+    first: int = 0,
+    **recipe: Any,
+) -> None:
+    """Write a fully synthetic dataset: ``objects`` objects, numbered from ``first``.
+
+    Args:
+        folder: where to write.
+        kind: "primitives" (like SynBench) or "tissue" (like DeformedTissue).
+        objects: number of objects, >= 1.
+        first: number of the first one; object i is the same in every dataset of equal seed.
+        recipe: the keywords of ``write_dataset`` except ``origin``.
+
+    Raises:
+        As ``write_dataset``.
+    """
+    if kind not in _GENERATORS:
+        raise ValueError(f"kind must be one of {', '.join(_GENERATORS)}, not {kind!r}.")
+    if objects < 1 or first < 0:
+        raise ValueError(f"objects must be at least 1 and first 0, not {objects} and {first}.")
+    generate = _GENERATORS[kind]
+    numbers = range(first, first + objects)
+    sources = [(f"{i:03d}", partial(generate, i, recipe["seed"])) for i in numbers]
+    identity = {"kind": kind, "objects": objects, "first": first}
+    _write(folder, sources, identity=identity, origin=SYNTHETIC, **recipe)
+
+
+def deform_bases(folder: str | os.PathLike, inventory: Inventory, **recipe: Any) -> None:
+    """Write a dataset of synthetic deformations of a user's own undeformed meshes or clouds.
+
+    Args:
+        folder: where to write.
+        inventory: what ``layout.scan`` found; its ``bases`` are deformed. They may differ in units,
+            be open, in several components or hold duplicate vertices.
+        recipe: the keywords of ``write_dataset`` except ``origin``.
+
+    Raises:
+        As ``write_dataset``.
+    """
+    sources = [(name, partial(read_surface, path)) for name, path in inventory.bases.items()]
+    identity = {name: _file_identity(path) for name, path in inventory.bases.items()}
+    origin = str(inventory.folder.resolve())
+    _write(folder, sources, identity=identity, origin=origin, **recipe)
+
+
+def _given(surface: Surface) -> Surface:
+    return surface
+
+
+def _fingerprint(surface: Surface) -> str:
+    faces = [] if surface.faces is None else surface.faces
+    arrays = (surface.vertices, np.asarray(faces, dtype=np.int64))
+    return digest([hashlib.sha256(np.ascontiguousarray(a)).hexdigest() for a in arrays])
+
+
+def _file_identity(path: Path) -> list[str]:
+    """Digests of the file and, for a SimTool ``.xyz``, of the file that holds its faces."""
+    parts = (path, path.with_suffix(".triangle"))
+    return [file_digest(part) for part in parts if os.access(part, os.R_OK) and part.is_file()]
+
+
+def _write(
+    folder: str | os.PathLike,
+    sources: list[_Named],
+    *,
+    identity: Any,
+    levels: Sequence[float],
+    control_percents: Sequence[float],
+    widths: Sequence[float],
+    amplitude: float,
+    points: int,
+    pairs_per_level: int,
+    seed: int,
+    origin: str,
+) -> None:
+    """``write_dataset`` for objects that are made or read one at a time.
+
+    ``identity`` stands for the content of all sources, so that it need not be made to find out
+    whether the folder is there already.
+    """
+    parameters = {
+        "levels": _distinct("levels", levels),
+        "control_percents": _distinct("control_percents", control_percents),
+        "widths": _distinct("widths", widths),
+        "amplitude": float(amplitude),
+        "points": int(points),
+        "pairs_per_level": int(pairs_per_level),
+        "seed": int(seed),
+    }
+    _check(parameters)
+    key = {
+        "made_by": _MAKER,
+        "dine_version": __version__,
+        "origin": origin,
+        "parameters": parameters,
+        "bases": identity,
+    }
+    folder = Path(folder).resolve()
+    part = folder.with_name(f".{folder.name}.part")
+    old = folder.with_name(f".{folder.name}.old")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(folder.with_name(f".{folder.name}.lock")):
+            if _is_made(folder, key):
+                logger.info("%s is there already, made from equal input: kept.", folder)
+                return
+            # Left behind by a run that was killed.
+            _remove(part)
+            _remove(old)
+            try:
+                _fill(part, sources, key)
+                if folder.exists():
+                    os.replace(folder, old)
+                os.replace(part, folder)
+            finally:
+                _remove(part)
+            _remove(old)
+    except OSError as error:
+        raise StorageError(
+            f"Could not write {folder}: {error.strerror or error}; free space or choose another "
+            "folder, then run the same command again."
+        ) from error
+
+
+def _distinct(name: str, values: Sequence[float]) -> list[float]:
+    """The values as floats, refused if empty or if two would give the same file name."""
+    values = [float(value) for value in values]
+    if not values or len({_text(value) for value in values}) < len(values):
+        raise ValueError(f"{name} must hold at least one value and none twice, not {values}.")
+    return values
+
+
+def _check(parameters: dict[str, Any]) -> None:
+    grid = itertools.product(
+        parameters["levels"], parameters["control_percents"], parameters["widths"]
+    )
+    for level, control_percent, width in grid:
+        check_recipe(
+            level=level,
+            control_percent=control_percent,
+            width=width,
+            amplitude=parameters["amplitude"],
+            points=parameters["points"],
+        )
+    if min(parameters["levels"]) == 0:
+        raise ValueError("levels must be above 0: a target at level 0 is its source.")
+    most = len(parameters["control_percents"]) * len(parameters["widths"])
+    if not 1 <= parameters["pairs_per_level"] <= most:
+        raise ValueError(
+            f"pairs_per_level must be 1 to {most}, the number of combinations of control_percents "
+            f"and widths, not {parameters['pairs_per_level']}."
+        )
+
+
+def _text(number: float) -> str:
+    return format(number, "g")
+
+
+def _is_made(folder: Path, key: dict[str, Any]) -> bool:
+    """Whether the folder is complete and made from equal input; refuses what DINE did not make."""
+    if not folder.exists():
+        return False
+    if folder.is_dir() and not any(folder.iterdir()):
+        return False
+    provenance = folder / "provenance.json"
+    stored = read_json(provenance) if provenance.is_file() else {}
+    if stored.get("made_by") != _MAKER:
+        raise DataError(
+            f"{folder} exists and holds something that was not made here; choose another folder, "
+            "or move it away."
+        )
+    return all(stored.get(name) == value for name, value in key.items())
+
+
+def _remove(folder: Path) -> None:
+    if folder.exists():
+        shutil.rmtree(folder)
+
+
+def _fill(folder: Path, sources: list[_Named], key: dict[str, Any]) -> None:
+    """Write everything; provenance.json, by which a folder counts as made, comes last."""
+    written: dict[str, str] = {}
+    left_out: dict[str, str] = {}
+    for name, load in sources:
+        safe = _safe(name)
+        try:
+            if safe in written:
+                raise DataError(
+                    f"its files would have the names of those of {written[safe]}; rename one."
+                )
+            surface = load()
+            targets = dict(_targets(surface, safe, key["parameters"]))
+        except DataError as error:
+            left_out[name] = str(error)
+            logger.warning("%s is left out: %s", name, error)
+            continue
+        written[safe] = name
+        base = folder / "Data" / f"{safe}.ply"
+        write_surface(base, surface)
+        for (level, pair), target in targets.items():
+            below = folder / "Deformation_Level" / level
+            with atomic_path(below / f"Source_{pair}.ply") as path:
+                shutil.copyfile(base, path)
+            write_surface(below / f"Target_{pair}.ply", target)
+    if not written:
+        first = list(left_out.items())[:3]
+        reasons = "; ".join(f"{name}: {reason.rstrip('.')}" for name, reason in first)
+        raise DataError(f"No object of {key['origin']} can be used ({reasons or 'there is none'}).")
+    provenance = {**key, "objects": written, "left_out": left_out}
+    write_text(folder / "README.txt", _readme(provenance))
+    write_json(folder / "provenance.json", provenance)
+
+
+def _safe(name: str) -> str:
+    """The name with only letters, digits, '_', '-' and '.' (not in front, which would hide it)."""
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", name).lstrip(".") or "-"
+
+
+def _targets(
+    surface: Surface, name: str, parameters: dict[str, Any]
+) -> Iterator[tuple[tuple[str, str], Surface]]:
+    """((level, <object>_<a>_<b>), deformed surface) of all pairs of one object."""
+    seed = parameters["seed"]
+    grid = list(itertools.product(parameters["control_percents"], parameters["widths"]))
+    for level in parameters["levels"]:
+        drawn = _rng(seed, name, _text(level)).permutation(len(grid))
+        for k, choice in enumerate(drawn[: parameters["pairs_per_level"]]):
+            control_percent, width = grid[choice]
+            field = rbf_displacement(
+                surface,
+                level=level,
+                control_percent=control_percent,
+                width=width,
+                amplitude=parameters["amplitude"],
+                points=parameters["points"],
+                rng=_rng(seed, name, _text(level), k),
+            )
+            pair = f"{name}_{_text(control_percent)}_{_text(width)}"
+            moved = Surface(surface.vertices + field, surface.faces, name=f"target {pair}")
+            yield (_text(level), pair), moved
+
+
+def _rng(*key: int | str) -> np.random.Generator:
+    return np.random.default_rng(int(digest(list(key)), 16))
+
+
+def _readme(provenance: dict[str, Any]) -> str:
+    if provenance["origin"] == SYNTHETIC:
+        head = (
+            "SYNTHETIC DATA. The objects and their deformations are computer-generated. They\n"
+            "stand in for a published dataset, follow the layout and the deformation recipe that\n"
+            "it describes, and hold none of its data. Results on them are no results on it."
+        )
+    else:
+        head = (
+            "REAL BASE OBJECTS, SYNTHETIC DEFORMATIONS. The undeformed objects come from\n"
+            f"{provenance['origin']}\n"
+            "Their deformations are computer-generated, not observed."
+        )
+    parameters = provenance["parameters"]
+    lines = "\n".join(f"  {name}: {json.dumps(value)}" for name, value in parameters.items())
+    return f"""{head}
+
+Recipe: round(a / 100 * points) control points, uniform on the surface, each with a normal random
+displacement of standard deviation amplitude * level per coordinate, in object radii; spread with
+exp(-(distance / b)^2), distances in object radii, and summed.
+
+{lines}
+
+Files: Data/<object>.ply holds the undeformed objects, Deformation_Level/<level>/ the pairs
+Source_<object>_<a>_<b>.ply and Target_<object>_<a>_<b>.ply; a is the percentage of control points,
+b the width of the Gaussian. Only the target is deformed: same vertices, same order, moved.
+
+{len(provenance["objects"])} objects, {len(provenance["left_out"])} left out (reasons in \
+provenance.json). Made by DINE {provenance["dine_version"]}.
+"""

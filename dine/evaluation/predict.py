@@ -1,0 +1,104 @@
+"""Predictions on disk: a model's displacement fields for every test pair and condition."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from dine.data.pairs import read_pairs, read_variant
+from dine.errors import DataError
+from dine.files import atomic_path, file_digest
+from dine.models.checkpoint import load_backbone
+from dine.results import CLEAN, condition_key
+from dine.training.stages import predict_fields
+
+FORMAT = "dine-predictions"
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """One condition's fields.
+
+    Attributes:
+        condition: ``deformation``, ``noise`` or ``outliers``.
+        corruption: noise standard deviation or percentage of outliers; 0 where clean.
+        pair: (P,) pair names.
+        displacement: (P, N, 3) float32, normalised frame.
+    """
+
+    condition: str
+    corruption: float
+    pair: np.ndarray
+    displacement: np.ndarray
+
+
+def predict(
+    model: Path,
+    pairs_path: Path,
+    variants: list[Path],
+    out: Path,
+    *,
+    name: str,
+    batch_size: int = 4,
+    device: str = "auto",
+) -> None:
+    """Predict the clean test split and its corrupted variants, and write all fields to HDF5."""
+    backbone, _ = load_backbone(model)
+    pairs = read_pairs(pairs_path, split="test")
+    if len(pairs) == 0:
+        raise DataError(f"{pairs_path} has no test pairs.")
+    conditions: list[tuple[str, float, np.ndarray | None]] = [(CLEAN, 0.0, None)]
+    for path in variants:
+        variant = read_variant(path, pairs)
+        conditions.append((variant.condition, variant.level, variant.target))
+    with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(
+            format=FORMAT, model=file_digest(model), pairs=file_digest(pairs_path), name=name
+        )
+        for condition, corruption, targets in conditions:
+            key = condition_key(condition, corruption)
+            fields = predict_fields(
+                backbone,
+                pairs,
+                name=f"{name} {key}",
+                batch_size=batch_size,
+                device=device,
+                targets=targets,
+            )
+            group = file.create_group(key)
+            group.attrs.update(condition=condition, corruption=corruption)
+            data = group.create_dataset(
+                "displacement", data=fields, chunks=(1, *fields.shape[1:]), fletcher32=True
+            )
+            data.attrs["description"] = "(P, N, 3) predicted displacements, normalised frame"
+            group.create_dataset("pair", data=pairs.name.astype(object), dtype=h5py.string_dtype())
+
+
+def read_predictions(path: Path) -> list[Prediction]:
+    """All conditions of a predictions file, the clean one first.
+
+    Raises:
+        DataError: missing, damaged, or another kind of file.
+    """
+    try:
+        with h5py.File(path) as file:
+            if file.attrs.get("format") != FORMAT:
+                raise DataError(f"{path} holds no predictions; expected {FORMAT}.")
+            found = [
+                Prediction(
+                    str(group.attrs["condition"]),
+                    float(group.attrs["corruption"]),
+                    group["pair"].asstr()[:].astype(str),
+                    group["displacement"][:],
+                )
+                for group in file.values()
+            ]
+    except FileNotFoundError:
+        raise DataError(f"{path} does not exist; run `dine predict` first.") from None
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path} is damaged ({error}); delete it and run again.") from error
+    order = {CLEAN: 0, "noise": 1, "outliers": 2}
+    return sorted(found, key=lambda p: (order.get(p.condition, 3), p.corruption))

@@ -1,0 +1,102 @@
+"""What every deformation prior can do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dine.errors import DataError
+from dine.models.checkpoint import load_state, load_tensors, save_tensors
+from dine.registry import Registry
+
+PRIORS: Registry[Prior] = Registry("prior")
+PRIOR_FORMAT = "dine-prior"
+
+
+class Prior(nn.Module):
+    """A density over displacement fields (B, N, 3) in the normalised frame, frozen once fitted.
+
+    A subclass is registered in :data:`PRIORS` (or named by import path), builds itself from
+    ``shape`` (whatever its tensors' sizes depend on), and implements :meth:`fit`,
+    :meth:`penalty`, :meth:`log_prob` and :meth:`sample`. Its buffers and parameters are what is
+    saved.
+
+    Attributes:
+        shape: constructor arguments, stored beside the tensors.
+        notes: facts about the fit that a reader should see, such as a reduced rank.
+    """
+
+    registered_name: str
+
+    def __init__(self, **shape: Any):
+        super().__init__()
+        self.shape = shape
+        self.notes: dict[str, Any] = {}
+
+    @classmethod
+    def fit(cls, fields: np.ndarray, *, seed: int = 0, **arguments: Any) -> Self:
+        """Estimate the prior from (K, N, 3) displacement fields."""
+        raise NotImplementedError
+
+    def penalty(self, displacement: Tensor, mask: Tensor | None = None) -> Tensor:
+        """The differentiable term that Stage 2 adds, (B, N, 3) to (B,).
+
+        −log p up to the constants that the paper drops; ``mask`` is True at valid points.
+        """
+        raise NotImplementedError
+
+    def log_prob(self, displacement: Tensor) -> Tensor:
+        """Log density of the modelled quantity, (B, N, 3) to (B,), constants included."""
+        raise NotImplementedError
+
+    def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+        """Fields drawn from the prior, (count, N, 3)."""
+        raise NotImplementedError
+
+    def freeze(self) -> Self:
+        """Fix all tensors; gradients still reach the displacement."""
+        return self.eval().requires_grad_(False)
+
+    def save(self, path: str | Path, **facts: Any) -> None:
+        """Write the prior atomically as safetensors."""
+        facts = {
+            "format": PRIOR_FORMAT,
+            "prior": self.registered_name,
+            "shape": self.shape,
+            "notes": self.notes,
+            **facts,
+        }
+        save_tensors(path, self.state_dict(), facts)
+
+
+def load_prior(path: str | Path) -> Prior:
+    """A frozen prior from its file.
+
+    Raises:
+        CheckpointError: missing, damaged, or of another kind.
+    """
+    tensors, facts = load_tensors(path, PRIOR_FORMAT)
+    prior = PRIORS.get(facts["prior"])(**facts["shape"])
+    load_state(prior, tensors, path)
+    prior.notes = facts["notes"]
+    return prior.freeze()
+
+
+def check_fields(fields: np.ndarray) -> np.ndarray:
+    """Fields as (K, N, 3) float64.
+
+    Raises:
+        DataError: another shape, fewer than two fields, or values that are not finite.
+    """
+    fields = np.asarray(fields, dtype=np.float64)
+    if fields.ndim != 3 or fields.shape[2] != 3:
+        raise DataError(f"Expected displacement fields of shape (K, N, 3), found {fields.shape}.")
+    if len(fields) < 2:
+        raise DataError(f"A prior needs at least 2 displacement fields, found {len(fields)}.")
+    if not np.isfinite(fields).all():
+        raise DataError("The displacement fields hold NaN or infinite values.")
+    return fields

@@ -1,0 +1,236 @@
+"""One self-contained HTML page about a run: plain findings, tables, figures and how it was made."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import pandas as pd
+import yaml
+
+from dine.errors import DataError
+from dine.files import write_text
+from dine.reporting import tables
+from dine.reporting.tables import Table, display_name
+
+# What a prior is compared with, by column of ``gains``.
+_RIVALS = {"gain_over_lambda0": "the control", "gain_over_stage1": "Stage 1"}
+_PIXELS_PER_DOT = 96 / 150
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A saved figure: the PNG is embedded, ``section`` groups figures under one heading."""
+
+    section: str
+    caption: str
+    png: str | os.PathLike
+
+
+def write_report(
+    path: str | os.PathLike,
+    metrics: pd.DataFrame,
+    report_tables: Sequence[Table],
+    figures: Sequence[ReportFigure] = (),
+    *,
+    index_agreement: Mapping[str, Any] | pd.DataFrame | None = None,
+    lambda_searches: Sequence[Mapping[str, Any]] = (),
+    config: Mapping[str, Any] | None = None,
+    versions: Mapping[str, str] | None = None,
+    step_seconds: Mapping[str, float] | None = None,
+    files: Mapping[str, str] | None = None,
+) -> Path:
+    """Write the report of a run.
+
+    Args:
+        path: the HTML file to write.
+        metrics: as ``load_metrics`` returns them; the findings are computed from these.
+        report_tables: usually ``all_tables(metrics)``.
+        figures: saved figures in reading order.
+        index_agreement: how well point i means the same place across pairs: a value by name, or a
+            frame whose columns are shown as they are.
+        lambda_searches: the results of the λ search, one per dataset and backbone.
+        config: the resolved configuration.
+        versions: version by package.
+        step_seconds: wall-clock seconds by step.
+        files: address relative to the report by label.
+
+    Raises:
+        DataError: a figure is missing, or a file address is not relative.
+    """
+    for label, address in (files or {}).items():
+        if "://" in address or address.startswith("/"):
+            raise DataError(f"The report can link {label} only by a relative path, not {address}.")
+    origins = metrics.drop_duplicates("dataset").set_index("dataset")["origin"]
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("dine.reporting", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    if isinstance(index_agreement, Mapping):
+        index_agreement = pd.DataFrame(
+            {"Quantity": list(index_agreement), "Value": list(index_agreement.values())}
+        )
+    text = environment.get_template("report.html").render(
+        origins=[
+            (
+                display_name(dataset),
+                origin,
+                tables.ORIGIN_NAMES[origin],
+                dataset in tables.DATASET_NAMES,
+            )
+            for dataset, origin in origins.items()
+        ],
+        findings=findings(metrics),
+        overview=_overview(metrics),
+        tables=[_display(table) for table in report_tables],
+        sections=_sections(figures),
+        agreement=None if index_agreement is None else _text_frame(index_agreement),
+        lambdas=_chosen_lambdas(lambda_searches),
+        config=None if config is None else yaml.safe_dump(dict(config), sort_keys=False),
+        versions=versions or {},
+        seconds={name: _duration(value) for name, value in (step_seconds or {}).items()},
+        files=files or {},
+    )
+    write_text(path, text)
+    return Path(path)
+
+
+# ------------------------------------------------------------------------------- findings
+
+
+def findings(metrics: pd.DataFrame) -> list[str]:
+    """What the numbers say, in sentences: per dataset and prior, over all settings."""
+    data = tables.gains(metrics)
+    sentences = []
+    for (dataset, method), rows in data.groupby(["dataset", "method"], sort=False):
+        origin = tables.ORIGIN_NAMES[tables.origin_of(dataset, metrics)]
+        backbones = " and ".join(display_name(name) for name in rows["backbone"].unique())
+        where = f"{display_name(dataset)} ({origin}), {backbones}"
+        name = display_name(method)
+        for column, rival in _RIVALS.items():
+            parts = [
+                _count_better(part[column].dropna(), settings)
+                for settings, part in _by_kind(rows)
+                if part[column].notna().any()
+            ]
+            if parts:
+                sentences.append(
+                    f"{where}: {name} has a lower mean CD than {rival} at {' and '.join(parts)}."
+                )
+            else:
+                sentences.append(
+                    f"{where}: {rival} was not evaluated on the same pairs, so {name} cannot be "
+                    "compared with it."
+                )
+    if not sentences:
+        sentences.append("No prior was evaluated in this run, so there is nothing to compare.")
+    return sentences
+
+
+def _by_kind(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    clean = rows["condition"] == "deformation"
+    kinds = [("deformation levels", rows[clean]), ("noise and outlier settings", rows[~clean])]
+    return [(name, part) for name, part in kinds if len(part)]
+
+
+def _count_better(gain: pd.Series, settings: str) -> str:
+    median = float(np.median(gain))
+    change = f"{abs(median):.1f} % {'lower' if median >= 0 else 'higher'}"
+    return f"{int((gain > 0).sum())} of {len(gain)} {settings} (median: {change})"
+
+
+def _overview(metrics: pd.DataFrame) -> list[list[str]]:
+    """The findings by backbone: settings won, then median and range of the reductions."""
+    rows = []
+    data = tables.gains(metrics)
+    for key, group in data.groupby(["dataset", "backbone", "method"], sort=False):
+        for settings, part in _by_kind(group):
+            cells = [*map(display_name, key), settings.capitalize()]
+            for column in (*_RIVALS, "lambda0_gain_over_stage1"):
+                gain = part[column].dropna()
+                cells.append(_spread(gain) if len(gain) else "–")
+            rows.append(cells)
+    return rows
+
+
+def _spread(gain: pd.Series) -> str:
+    low, middle, high = (f"{value:.1f}" for value in np.percentile(gain, (0, 50, 100)))
+    won = f"{(gain > 0).sum()} of {len(gain)}"
+    return f"{won}: {middle} % ({low} to {high})".replace("-", "−")
+
+
+# ------------------------------------------------------------------------------ rendering
+
+
+def _display(table: Table) -> dict[str, Any]:
+    groups = tables.header_groups(table.header)
+    return {
+        "name": table.name,
+        "title": table.title,
+        "caption": table.caption,
+        "groups": groups if any(group for group, _ in groups) else [],
+        "header": table.header,
+        "rows": table.rows,
+    }
+
+
+def _sections(figures: Sequence[ReportFigure]) -> dict[str, list[tuple[str, str, int]]]:
+    sections: dict[str, list[tuple[str, str, int]]] = {}
+    for figure in figures:
+        try:
+            data = Path(figure.png).read_bytes()
+        except OSError as error:
+            raise DataError(f"The figure {figure.png} cannot be read; draw it again.") from error
+        # A PNG starts with a signature and its header chunk; bytes 16 to 19 hold the width.
+        if data[:8] != b"\x89PNG\r\n\x1a\n":
+            raise DataError(f"The figure {figure.png} is not a PNG image; draw it again.")
+        width = round(int.from_bytes(data[16:20], "big") * _PIXELS_PER_DOT)
+        image = base64.b64encode(data).decode()
+        sections.setdefault(figure.section, []).append((figure.caption, image, width))
+    return sections
+
+
+def _text_frame(frame: pd.DataFrame) -> dict[str, list]:
+    rows = [[_text(value) for value in row] for row in frame.itertuples(index=False)]
+    return {"header": [str(name) for name in frame.columns], "rows": rows}
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float | np.floating):
+        return "–" if np.isnan(value) else f"{value:.4g}"
+    return str(value)
+
+
+def _chosen_lambdas(searches: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Per prior: the choice, its validation errors and those of the λ = 0 control."""
+    rows = []
+    for search in searches:
+        curve = pd.DataFrame(search["curve"]).astype({"lambda": float, "cd": float, "mce": float})
+        for prior, chosen in search["selected"].items():
+            line = curve[curve["prior"] == prior]
+            cells = [f"{float(chosen):g}"]
+            for value in (float(chosen), 0.0):
+                row = line[np.isclose(line["lambda"], value, rtol=1e-6, atol=0)]
+                cd, mce = (row[name].mean() for name in ("cd", "mce"))
+                cells.append(_text(cd * tables.CD_SCALE))
+                cells.append(_text(mce))
+            names = [display_name(search[key]) for key in ("dataset", "backbone")]
+            rows.append([*names, display_name(prior), *cells])
+    return rows
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {seconds:02d} s"

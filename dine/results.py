@@ -1,0 +1,101 @@
+"""Where everything lies below the results folder: the one place that knows file names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from dine.config import STAGE1, Config
+
+CLEAN = "deformation"
+
+PAPER_TABLES = {("deformedtissue", False): 1, ("synbench", False): 2, ("deformedtissue", True): 3}
+"""Number of the paper's table by dataset and whether targets are corrupted."""
+
+
+def condition_key(condition: str, corruption: float) -> str:
+    """Name of a condition in files: ``deformation``, ``noise_0.03``, ``outliers_25``."""
+    return condition if condition == CLEAN else f"{condition}_{corruption:g}"
+
+
+@dataclass(frozen=True)
+class Results:
+    """Paths below ``root``; a run is ``stage1`` or ``stage2/<variant>``."""
+
+    root: Path
+
+    def dataset(self, dataset: str, file: str) -> Path:
+        return self.root / dataset / file
+
+    def variant(self, dataset: str, condition: str, corruption: float) -> Path:
+        return self.root / dataset / "variants" / f"{condition_key(condition, corruption)}.h5"
+
+    def run(self, dataset: str, backbone: str, method: str, file: str) -> Path:
+        folder = STAGE1 if method == STAGE1 else f"stage2/{method}"
+        return self.root / dataset / backbone / folder / file
+
+    def prior(self, dataset: str, backbone: str, prior: str) -> Path:
+        return self.root / dataset / backbone / "priors" / f"{prior}.safetensors"
+
+    @property
+    def search(self) -> Path:
+        return self.root / "lambda" / "lambda.json"
+
+
+def conditions(config: Config, dataset: str) -> list[tuple[str, float]]:
+    """The corrupted conditions of a dataset."""
+    corruption = config.datasets[dataset].corruption
+    return [("noise", x) for x in corruption.noise] + [("outliers", x) for x in corruption.outliers]
+
+
+def runs(config: Config) -> list[tuple[str, str, str]]:
+    """Every evaluated (dataset, backbone, method)."""
+    return [
+        (dataset, backbone, method)
+        for dataset in config.datasets
+        for backbone in config.backbones
+        for method in config.methods(backbone)
+    ]
+
+
+def pca_priors(config: Config, backbone: str) -> list[str]:
+    """The PCA priors used with a backbone, whose spectrum and modes are drawn."""
+    return [p for p in config.backbones[backbone].priors if config.priors[p].kind == "pca"]
+
+
+def figure_names(config: Config) -> list[str]:
+    """Stems of all figures of a run, in the order of the report."""
+    names = []
+    for dataset in config.datasets:
+        kinds = [CLEAN, *dict.fromkeys(kind for kind, _ in conditions(config, dataset))]
+        names += [f"distance_{dataset}_{kind}" for kind in kinds]
+        for backbone in config.backbones:
+            names += [f"{kind}_{dataset}_{backbone}" for kind in ("qualitative", "histogram")]
+    names.append("lambda")
+    for dataset in config.datasets:
+        for backbone in config.backbones:
+            for prior in pca_priors(config, backbone):
+                names += [f"{kind}_{dataset}_{backbone}_{prior}" for kind in ("spectrum", "modes")]
+            names.append(f"training_{dataset}_{backbone}")
+    return names
+
+
+def table_name(dataset: str, corrupted: bool) -> str:
+    """Stem of a table of Chamfer distances: the paper's number where it has one."""
+    number = PAPER_TABLES.get((dataset, corrupted))
+    if number:
+        return f"table{number}"
+    return f"{'corruption' if corrupted else 'deformation'}_{dataset}"
+
+
+def table_names(config: Config) -> list[str]:
+    """Stems of all tables of a run."""
+    names = []
+    for dataset in config.datasets:
+        names.append(table_name(dataset, corrupted=False))
+        if conditions(config, dataset):
+            names += [table_name(dataset, corrupted=True), f"observed_{dataset}"]
+        names.append(f"correspondence_{dataset}")
+        if any(backbone.priors for backbone in config.backbones.values()):
+            names.append(f"gains_{dataset}")
+    return names

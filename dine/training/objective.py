@@ -1,0 +1,70 @@
+"""What Stage 1 and Stage 2 minimise: a data term plus λ times a prior's penalty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from dine.data.batch import Batch
+from dine.errors import ConfigError
+from dine.geometry.chamfer import chamfer_distance, masked_mean
+from dine.priors.base import Prior
+from dine.registry import Registry
+
+DATA_TERMS: Registry[DataTerm] = Registry("data term")
+
+
+class DataTerm:
+    """Measures how well a displaced source fits; callable, giving one value per pair."""
+
+    registered_name: str
+
+    def __call__(self, batch: Batch, displacement: Tensor, truth: Tensor | None) -> Tensor:
+        """(B, N, 3) predicted and, where known, true displacement to (B,)."""
+        raise NotImplementedError
+
+
+@DATA_TERMS.register("chamfer")
+class Chamfer(DataTerm):
+    """Symmetric squared Chamfer distance between moved source and target (the paper's L_CD)."""
+
+    def __call__(self, batch: Batch, displacement: Tensor, truth: Tensor | None) -> Tensor:
+        return chamfer_distance(
+            batch.source + displacement, batch.target, batch.source_mask, batch.target_mask
+        )
+
+
+@DATA_TERMS.register("l1")
+class TrueDisplacement(DataTerm):
+    """Mean absolute error of the displacement's coordinates; needs the true displacement."""
+
+    def __call__(self, batch: Batch, displacement: Tensor, truth: Tensor | None) -> Tensor:
+        if truth is None:
+            raise ConfigError("The data term 'l1' needs pairs with a known true displacement.")
+        return masked_mean((displacement - truth).abs().mean(-1), batch.source_mask)
+
+
+@dataclass(frozen=True)
+class Objective:
+    """data term + weight · prior penalty, averaged over the batch.
+
+    Attributes:
+        data_term: how well the moved source fits the target.
+        prior: frozen prior, or None for the data term alone.
+        weight: λ; with 0 the prior is not evaluated at all.
+    """
+
+    data_term: DataTerm
+    prior: Prior | None = None
+    weight: float = 0.0
+
+    def __call__(
+        self, batch: Batch, displacement: Tensor, truth: Tensor | None
+    ) -> tuple[Tensor, dict[str, float]]:
+        """The loss (a scalar) and its parts as numbers."""
+        data = self.data_term(batch, displacement, truth).mean()
+        if self.prior is None or self.weight == 0:
+            return data, {"data": data.item(), "penalty": 0.0}
+        penalty = self.prior.penalty(displacement, batch.source_mask).mean()
+        return data + self.weight * penalty, {"data": data.item(), "penalty": penalty.item()}

@@ -1,0 +1,395 @@
+"""The paper's steps, each from files to files: Stage 1, fields, priors, search of λ, Stage 2."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+from dine.config import (
+    CONTROL,
+    LambdaSearch,
+    PriorConfig,
+    Stage1,
+    Stage2,
+    Training,
+    check_arguments,
+)
+from dine.data.pairs import PairSet, read_pairs
+from dine.errors import CheckpointError, ConfigError, DataError
+from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
+from dine.models.backbones import BACKBONES, Backbone
+from dine.models.checkpoint import load_backbone, save_backbone
+from dine.priors import PRIORS, load_prior
+from dine.provenance import code_digest, run_record
+from dine.training.loop import Batches, chosen_device, history_csv, train
+from dine.training.objective import DATA_TERMS, Objective
+from dine.training.progress import Progress
+
+log = logging.getLogger(__name__)
+
+WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
+FIELDS_FORMAT = "dine-fields"
+
+
+def new_backbone(kind: str, arguments: dict[str, Any], seed: int) -> Backbone:
+    """A backbone with random weights that depend on the seed only."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        try:
+            return BACKBONES.get(kind)(**arguments)
+        except TypeError as error:
+            raise ConfigError(
+                f"The backbone {kind!r} does not take these arguments: {error}."
+            ) from None
+
+
+def shipped_weights(kind: str) -> Path:
+    """The pretrained weights that come with the package.
+
+    Raises:
+        ConfigError: there are none for this backbone.
+    """
+    path = WEIGHTS / f"{kind}.safetensors"
+    if not path.is_file():
+        raise ConfigError(
+            f"There are no pretrained weights for the backbone {kind!r}; set `stage1.start` to "
+            "random or to a file of weights."
+        )
+    return path
+
+
+def starting_backbone(kind: str, arguments: dict[str, Any], start: str, seed: int) -> Backbone:
+    """Stage 1's first weights: ``random``, ``pretrained``, or a file.
+
+    Raises:
+        CheckpointError: the file holds another backbone, or other arguments than asked for.
+    """
+    backbone = new_backbone(kind, arguments, seed)
+    if start == "random":
+        return backbone
+    path = shipped_weights(kind) if start == "pretrained" else Path(start)
+    given, _ = load_backbone(path)
+    if given.registered_name != backbone.registered_name or given.arguments != backbone.arguments:
+        raise CheckpointError(
+            f"{path} holds {given.registered_name} with {given.arguments}; the configuration asks "
+            f"for {backbone.registered_name} with {backbone.arguments}."
+        )
+    return given
+
+
+def _run(
+    backbone: Backbone,
+    objective: Objective,
+    pairs_paths: list[Path],
+    settings: Training,
+    *,
+    seed: int,
+    out: Path,
+    name: str,
+    device: str,
+    inputs: dict[str, Any],
+    facts: dict[str, Any],
+    on_step: Callable[[int], None] | None = None,
+) -> None:
+    """Train and write ``model.safetensors``, ``history.csv`` and ``run.json`` into ``out``."""
+    pairs_digests = [file_digest(path) for path in pairs_paths]
+    inputs = {"pairs": pairs_digests, **inputs}
+    identity = {
+        "settings": digest({**settings.model_dump(), "arguments": backbone.arguments}),
+        "seed": str(seed),
+        "inputs": digest(inputs),
+        "code": code_digest("model", "priors", "training"),
+    }
+    train_pairs = PairSet.concatenate([read_pairs(path, split="train") for path in pairs_paths])
+    val_pairs = PairSet.concatenate([read_pairs(path, split="val") for path in pairs_paths])
+    began = time.monotonic()
+    history = train(
+        backbone,
+        objective,
+        train_pairs,
+        val_pairs,
+        settings,
+        seed=seed,
+        folder=out / "training",
+        identity=identity,
+        name=name,
+        device=device,
+        on_step=on_step,
+    )
+    # Weights carry nothing that differs between two equal runs, so they can be compared by bytes.
+    save_backbone(out / "model.safetensors", backbone, name=name, seed=seed, steps=settings.steps)
+    write_text(out / "history.csv", history_csv(history))
+    write_json(
+        out / "run.json",
+        run_record(
+            settings.model_dump(),
+            seed,
+            name=name,
+            device=str(chosen_device(device)),
+            threads=torch.get_num_threads(),
+            train_pairs=len(train_pairs),
+            val_pairs=len(val_pairs),
+            inputs=inputs,
+            identity=identity,
+            training_seconds=history[-1]["seconds"],
+            wall_seconds=time.monotonic() - began,
+            final={k: v for k, v in history[-1].items() if k != "step"},
+            **facts,
+        ),
+    )
+
+
+def stage1(
+    pairs: Path,
+    kind: str,
+    arguments: dict[str, Any],
+    settings: Stage1,
+    *,
+    seed: int,
+    out: Path,
+    name: str,
+    device: str = "auto",
+    on_step: Callable[[int], None] | None = None,
+) -> None:
+    """Train a backbone on the data term alone."""
+    backbone = starting_backbone(kind, arguments, settings.start, seed)
+    start = settings.start
+    if start != "random":
+        start = file_digest(shipped_weights(kind) if start == "pretrained" else start)
+    _run(
+        backbone,
+        Objective(DATA_TERMS.get(settings.data_term)()),
+        [pairs],
+        settings,
+        seed=seed,
+        out=out,
+        name=name,
+        device=device,
+        inputs={"start": start},
+        facts={"stage": 1, "backbone": kind, "arguments": backbone.arguments},
+        on_step=on_step,
+    )
+
+
+def pretrain(
+    pairs: list[Path],
+    kind: str,
+    arguments: dict[str, Any],
+    settings: Training,
+    *,
+    seed: int,
+    out: Path,
+    device: str = "auto",
+) -> None:
+    """Train weights to start from, on the true displacements of synthetic pairs."""
+    _run(
+        new_backbone(kind, arguments, seed),
+        Objective(DATA_TERMS.get(settings.data_term)()),
+        pairs,
+        settings,
+        seed=seed,
+        out=out,
+        name=f"pretraining/{kind}",
+        device=device,
+        inputs={"start": "random"},
+        facts={"stage": 0, "backbone": kind, "data": "synthetic", "arguments": arguments},
+    )
+
+
+@torch.no_grad()
+def predict_fields(
+    backbone: Backbone,
+    pairs: PairSet,
+    *,
+    name: str,
+    batch_size: int = 4,
+    device: str = "auto",
+    targets: np.ndarray | None = None,
+) -> np.ndarray:
+    """Displacement fields of all pairs, (P, N, 3) float32, in the pairs' order.
+
+    ``targets`` (P, M, 3) stands in for the clean targets. Each target's points come in a shuffled
+    order, as in training.
+    """
+    where = chosen_device(device)
+    backbone.to(where).eval()
+    batches = Batches(pairs, where)
+    fields = np.empty(pairs.source.shape, np.float32)
+    with Progress(name, len(pairs), unit="pair") as progress:
+        for start in range(0, len(pairs), batch_size):
+            index = np.arange(start, min(start + batch_size, len(pairs)))
+            batch, _ = batches.get(index, np.random.default_rng([2, start]), targets)
+            fields[index] = backbone(batch).displacement.cpu().numpy()
+            progress.update(len(index))
+    return fields
+
+
+def dump_fields(
+    model: Path, pairs: Path, out: Path, *, name: str, batch_size: int = 4, device: str = "auto"
+) -> None:
+    """Write a model's displacement fields of the training split to HDF5."""
+    backbone, _ = load_backbone(model)
+    train_pairs = read_pairs(pairs, split="train")
+    fields = predict_fields(backbone, train_pairs, name=name, batch_size=batch_size, device=device)
+    with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(format=FIELDS_FORMAT, model=file_digest(model), pairs=file_digest(pairs))
+        data = file.create_dataset(
+            "displacement", data=fields, chunks=(1, *fields.shape[1:]), fletcher32=True
+        )
+        data.attrs["description"] = "(K, N, 3) predicted displacements, normalised frame"
+        file.create_dataset("name", data=train_pairs.name.astype(object), dtype=h5py.string_dtype())
+
+
+def read_fields(path: Path) -> np.ndarray:
+    """The (K, N, 3) fields of :func:`dump_fields`.
+
+    Raises:
+        DataError: missing, damaged, or another kind of file.
+    """
+    try:
+        with h5py.File(path) as file:
+            if file.attrs.get("format") != FIELDS_FORMAT:
+                raise DataError(f"{path} holds no displacement fields; expected {FIELDS_FORMAT}.")
+            return file["displacement"][:]
+    except FileNotFoundError:
+        raise DataError(f"{path} does not exist; run `dine fields` first.") from None
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path} is damaged ({error}); delete it and run again.") from error
+
+
+def fit_prior(fields: Path, prior: PriorConfig, *, seed: int, out: Path) -> None:
+    """Fit a prior to dumped fields and write it, frozen."""
+    arguments = check_arguments(prior)
+    began = time.monotonic()
+    fitted = PRIORS.get(prior.kind).fit(read_fields(fields), seed=seed, **arguments)
+    fitted.save(out, arguments=arguments, fields=file_digest(fields), seed=seed)
+    log.info("fitted the %s prior in %.1f s", prior.kind, time.monotonic() - began)
+
+
+def selected_lambda(path: Path, prior: str) -> float:
+    """λ for a prior, from the file of the search.
+
+    Raises:
+        DataError: the file is not a search's result.
+    """
+    result = read_json(path)
+    try:
+        selected = result["selected"]
+        return float(selected.get(prior, selected[result["default"]]))
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise DataError(f"{path} is not the result of `dine search-lambda`.") from None
+
+
+def stage2(
+    pairs: Path,
+    model: Path,
+    settings: Stage2,
+    *,
+    variant: str,
+    prior: Path | None,
+    weight: float,
+    seed: int,
+    out: Path,
+    name: str,
+    device: str = "auto",
+    on_step: Callable[[int], None] | None = None,
+) -> None:
+    """Refine a Stage-1 model with λ times a frozen prior; ``lambda0`` is the control without."""
+    if (prior is None) != (variant == CONTROL):
+        raise ConfigError(
+            f"The variant {variant!r} {'needs' if prior is None else 'takes no'} prior."
+        )
+    backbone, facts = load_backbone(model)
+    _run(
+        backbone,
+        Objective(
+            DATA_TERMS.get(settings.data_term)(), load_prior(prior) if prior else None, weight
+        ),
+        [pairs],
+        settings,
+        seed=seed,
+        out=out,
+        name=name,
+        device=device,
+        inputs={
+            "model": file_digest(model),
+            "prior": file_digest(prior) if prior else None,
+            "lambda": weight,
+        },
+        facts={"stage": 2, "variant": variant, "lambda": weight, "backbone": facts["backbone"]},
+        on_step=on_step,
+    )
+
+
+def search_lambda(
+    pairs: Path,
+    model: Path,
+    priors: dict[str, Path],
+    stage: Stage2,
+    search: LambdaSearch,
+    *,
+    seed: int,
+    out: Path,
+    device: str = "auto",
+) -> None:
+    """Try each λ on a shortened Stage 2 and keep the one with the lowest validation Chamfer distance.
+
+    λ = 0 is trained too, once, for comparison, but never chosen. Each candidate's result is kept,
+    so that an interrupted search goes on with the next one.
+    """
+    # One validation, at the end, on more pairs than training looks at.
+    settings = stage.model_copy(
+        update={
+            "steps": search.steps,
+            "validate_every": search.steps,
+            "validation_pairs": search.validation_pairs,
+        }
+    )
+    folder = out.parent / "candidates"
+    curve = []
+    runs: list[tuple[str, float]] = [(CONTROL, 0.0)]
+    runs += [(prior, weight) for prior in priors for weight in sorted(search.candidates)]
+    for prior, weight in runs:
+        here = folder / f"{prior}_{weight:g}"
+        stage2(
+            pairs,
+            model,
+            settings,
+            variant=prior,
+            prior=priors.get(prior),
+            weight=weight,
+            seed=seed,
+            out=here,
+            name=f"search of λ: {prior} {weight:g}",
+            device=device,
+        )
+        final = read_json(here / "run.json")["final"]
+        # The control is every prior's value at λ = 0.
+        for label in priors if prior == CONTROL else (prior,):
+            curve.append(
+                {"prior": label, "lambda": weight, "cd": final["val_cd"], "mce": final["val_mce"]}
+            )
+    selected = {}
+    for prior in priors:
+        tried = [row for row in curve if row["prior"] == prior and row["lambda"] > 0]
+        selected[prior] = min(tried, key=lambda row: row["cd"])["lambda"]
+    write_json(
+        out,
+        {
+            "dataset": search.dataset,
+            "backbone": search.backbone,
+            "default": next(iter(priors)),
+            "selected": selected,
+            "curve": curve,
+            "steps": search.steps,
+            "validation_pairs": search.validation_pairs,
+            "seed": seed,
+        },
+    )

@@ -1,0 +1,66 @@
+# What every rule shares: the checked configuration, paths, names and parameters.
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+from snakemake.exceptions import WorkflowError
+
+from dine import config as dine_config
+from dine.errors import ConfigError
+from dine.provenance import code_digest, folder_signature
+from dine.results import Results, conditions, figure_names, runs, table_names
+
+try:
+    CONFIG = dine_config.validate(config)
+except ConfigError as error:
+    raise WorkflowError(str(error))
+
+RESULTS = Path(CONFIG.results)
+FILES = Results(RESULTS)
+FIGURES = figure_names(CONFIG)
+TABLES = table_names(CONFIG)
+RUNS = runs(CONFIG)
+
+# Rules call the `dine` that belongs to the Python that runs Snakemake.
+shell.prefix(
+    f"set -euo pipefail; export PATH={str(Path(sys.executable).parent)!r}:$PATH; "
+)
+
+GPUS = int(
+    CONFIG.device == "cuda"
+    or (CONFIG.device == "auto" and shutil.which("nvidia-smi") is not None)
+)
+THREADS = CONFIG.threads
+
+# Where rule logs, benchmarks and the run folder of a method lie.
+LOGS = RESULTS / "logs"
+BENCHMARKS = RESULTS / "benchmarks"
+
+
+wildcard_constraints:
+    dataset="|".join(CONFIG.datasets),
+    backbone="|".join(CONFIG.backbones),
+    prior="|".join(CONFIG.priors),
+    run="stage1|stage2/(?:" + "|".join([dine_config.CONTROL, *CONFIG.priors]) + ")",
+    condition="noise|outliers",
+    corruption=r"\d+(?:\.\d+)?",
+    shape="primitives|tissue",
+
+
+def section(model, **changes):
+    """One narrow section of the configuration as text, for a rule's params and command line."""
+    values = model.model_dump(mode="json", exclude_none=True) | changes
+    return json.dumps(values, sort_keys=True)
+
+
+def variant_files(wildcards):
+    return [
+        FILES.variant(wildcards.dataset, *condition)
+        for condition in conditions(CONFIG, wildcards.dataset)
+    ]
+
+
+def method_of(run):
+    return run.removeprefix("stage2/")

@@ -1,0 +1,102 @@
+# Raw meshes, index-consistent pairs, corrupted targets.
+
+
+def raw_settings(wildcards):
+    dataset = CONFIG.datasets[wildcards.dataset]
+    # Not the split, nor the convention: changing those does not change the raw files.
+    return json.dumps(
+        {
+            "source": dataset.source.model_dump(exclude_none=True),
+            "recipe": dataset.recipe.model_dump(),
+            "pairs": {"points": dataset.pairs.points},
+        },
+        sort_keys=True,
+    )
+
+
+def raw_signature(wildcards):
+    """Changes when a user's own folder does; Snakemake cannot know which files will be read."""
+    source = CONFIG.datasets[wildcards.dataset].source
+    return (
+        folder_signature(Path(source.folder).expanduser())
+        if source.kind == "path"
+        else ""
+    )
+
+
+rule raw:
+    output:
+        raw=RESULTS / "{dataset}" / "raw.json",
+        inventory=RESULTS / "{dataset}" / "inventory.csv",
+        left_out=RESULTS / "{dataset}" / "left_out.csv",
+    log:
+        LOGS / "{dataset}" / "raw.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "raw.tsv"
+    conda:
+        "../envs/dine.yaml"
+    params:
+        settings=raw_settings,
+        signature=raw_signature,
+        seed=CONFIG.seed,
+        code=code_digest("raw"),
+    shell:
+        "dine --log {log} raw --settings {params.settings:q} --seed {params.seed}"
+        " --out $(dirname {output.raw:q})"
+
+
+rule pairs:
+    input:
+        rules.raw.output.raw,
+    output:
+        RESULTS / "{dataset}" / "pairs.h5",
+    log:
+        LOGS / "{dataset}" / "pairs.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "pairs.tsv"
+    conda:
+        "../envs/dine.yaml"
+    params:
+        settings=lambda wildcards: section(CONFIG.datasets[wildcards.dataset].pairs),
+        seed=CONFIG.seed,
+        code=code_digest("pairs"),
+    shell:
+        "dine --log {log} pairs --raw {input:q} --settings {params.settings:q}"
+        " --seed {params.seed} --out {output:q}"
+
+
+rule agreement:
+    input:
+        rules.pairs.output,
+    output:
+        RESULTS / "{dataset}" / "agreement.json",
+    log:
+        LOGS / "{dataset}" / "agreement.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "agreement.tsv"
+    conda:
+        "../envs/dine.yaml"
+    params:
+        seed=CONFIG.seed,
+        code=code_digest("pairs"),
+    shell:
+        "dine --log {log} agreement --pairs {input:q} --seed {params.seed} --out {output:q}"
+
+
+rule corrupt:
+    input:
+        rules.pairs.output,
+    output:
+        RESULTS / "{dataset}" / "variants" / "{condition}_{corruption}.h5",
+    log:
+        LOGS / "{dataset}" / "variants" / "{condition}_{corruption}.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "variants" / "{condition}_{corruption}.tsv"
+    conda:
+        "../envs/dine.yaml"
+    params:
+        seed=CONFIG.seed,
+        code=code_digest("corrupt"),
+    shell:
+        "dine --log {log} corrupt --pairs {input:q} --condition {wildcards.condition}"
+        " --level {wildcards.corruption} --seed {params.seed} --out {output:q}"

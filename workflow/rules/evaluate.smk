@@ -1,0 +1,58 @@
+# Predictions first, then metrics from them.
+
+
+def variant_options(wildcards, input):
+    return " ".join(f"--variant {path}" for path in input.variants)
+
+
+rule predict:
+    input:
+        model=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "model.safetensors",
+        pairs=rules.pairs.output,
+        variants=variant_files,
+    output:
+        RESULTS / "{dataset}" / "{backbone}" / "{run}" / "predictions.h5",
+    log:
+        LOGS / "{dataset}" / "{backbone}" / "{run}" / "predict.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "{backbone}" / "{run}" / "predict.tsv"
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        variants=variant_options,
+        batch=CONFIG.evaluation.batch_size,
+        device=CONFIG.device,
+        code=code_digest("model"),
+    shell:
+        "dine --log {log} --threads {threads} predict --model {input.model:q}"
+        " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
+        " --device {params.device}"
+        " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.run}' --out {output:q}"
+
+
+rule evaluate:
+    input:
+        predictions=rules.predict.output,
+        pairs=rules.pairs.output,
+        variants=variant_files,
+    output:
+        metrics=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "metrics.csv",
+        point_errors=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "point_errors.h5",
+    log:
+        LOGS / "{dataset}" / "{backbone}" / "{run}" / "evaluate.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "{backbone}" / "{run}" / "evaluate.tsv"
+    conda:
+        "../envs/dine.yaml"
+    params:
+        variants=variant_options,
+        method=lambda wildcards: method_of(wildcards.run),
+        code=code_digest("evaluation"),
+    shell:
+        "dine --log {log} evaluate --predictions {input.predictions:q} --pairs {input.pairs:q}"
+        " {params.variants} --dataset {wildcards.dataset} --backbone {wildcards.backbone}"
+        " --method {params.method} --point-errors {output.point_errors:q}"
+        " --out {output.metrics:q}"

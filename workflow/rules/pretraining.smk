@@ -1,0 +1,93 @@
+# Weights of our own to start Stage 1 from; `snakemake -j2 pretrained`. Not part of `all`.
+
+PRETRAINING = RESULTS / "pretraining"
+# Far beyond the numbers that any dataset uses, so that no object is trained on and tested on.
+FIRST_OBJECT = 1_000_000
+RECIPES = {
+    "primitives": ("sphere", [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8]),
+    "tissue": ("disc", [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]),
+}
+
+
+rule pretraining_raw:
+    output:
+        PRETRAINING / "{shape}" / "raw.json",
+    log:
+        LOGS / "pretraining" / "{shape}_raw.log",
+    conda:
+        "../envs/dine.yaml"
+    params:
+        settings=lambda wildcards: json.dumps(
+            {
+                "recipe": {
+                    "shape": wildcards.shape,
+                    "objects": CONFIG.pretraining.objects // 2,
+                    "levels": RECIPES[wildcards.shape][1],
+                }
+            },
+            sort_keys=True,
+        ),
+        first=FIRST_OBJECT,
+        seed=CONFIG.seed,
+        code=code_digest("raw"),
+    shell:
+        "dine --log {log} raw --settings {params.settings:q} --first-object {params.first}"
+        " --seed {params.seed} --out $(dirname {output:q})"
+
+
+rule pretraining_pairs:
+    input:
+        rules.pretraining_raw.output,
+    output:
+        PRETRAINING / "{shape}" / "pairs.h5",
+    log:
+        LOGS / "pretraining" / "{shape}_pairs.log",
+    conda:
+        "../envs/dine.yaml"
+    params:
+        settings=lambda wildcards: json.dumps(
+            {
+                "convention": RECIPES[wildcards.shape][0],
+                "split": {"train": 0.9, "val": 0.05, "test": 0.05},
+            },
+            sort_keys=True,
+        ),
+        seed=CONFIG.seed,
+        code=code_digest("pairs"),
+    shell:
+        "dine --log {log} pairs --raw {input:q} --settings {params.settings:q}"
+        " --seed {params.seed} --out {output:q}"
+
+
+rule pretrain:
+    input:
+        expand(rules.pretraining_pairs.output, shape=RECIPES),
+    output:
+        model=PRETRAINING / "{backbone}" / "model.safetensors",
+        history=PRETRAINING / "{backbone}" / "history.csv",
+        record=PRETRAINING / "{backbone}" / "run.json",
+    log:
+        LOGS / "pretraining" / "{backbone}.log",
+    benchmark:
+        BENCHMARKS / "pretraining" / "{backbone}.tsv"
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        pairs=lambda wildcards, input: " ".join(f"--pairs {path}" for path in input),
+        backbone=backbone_settings,
+        settings=section(CONFIG.pretraining),
+        seed=CONFIG.seed,
+        device=CONFIG.device,
+        code=code_digest("model", "training"),
+    shell:
+        "dine --log {log} --threads {threads} pretrain {params.pairs}"
+        " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
+        " --device {params.device} --out $(dirname {output.model:q})"
+
+
+rule pretrained:
+    input:
+        expand(rules.pretrain.output, backbone=CONFIG.backbones),

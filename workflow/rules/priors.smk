@@ -1,0 +1,71 @@
+# Priors, fitted to Stage-1 fields of the training split and frozen; the search of λ.
+
+
+def prior_settings(wildcards):
+    prior = CONFIG.priors[wildcards.prior]
+    return json.dumps(
+        {"kind": prior.kind, "arguments": dine_config.check_arguments(prior)},
+        sort_keys=True,
+    )
+
+
+rule fit_prior:
+    input:
+        rules.fields.output,
+    output:
+        RESULTS / "{dataset}" / "{backbone}" / "priors" / "{prior}.safetensors",
+    log:
+        LOGS / "{dataset}" / "{backbone}" / "priors" / "{prior}.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "{backbone}" / "priors" / "{prior}.tsv"
+    priority: 30
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    params:
+        settings=prior_settings,
+        seed=CONFIG.seed,
+        code=code_digest("priors"),
+    shell:
+        "dine --log {log} --threads {threads} fit-prior --fields {input:q}"
+        " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
+
+
+SEARCH = CONFIG.lambda_search
+
+
+rule search_lambda:
+    input:
+        pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
+        model=FILES.run(SEARCH.dataset, SEARCH.backbone, "stage1", "model.safetensors"),
+        priors=[
+            FILES.prior(SEARCH.dataset, SEARCH.backbone, prior)
+            for prior in SEARCH.priors
+        ],
+    output:
+        FILES.search,
+    log:
+        LOGS / "search_lambda.log",
+    benchmark:
+        BENCHMARKS / "search_lambda.tsv"
+    priority: 40
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        priors=" ".join(
+            f"--prior {prior} {FILES.prior(SEARCH.dataset, SEARCH.backbone, prior)}"
+            for prior in SEARCH.priors
+        ),
+        stage2=section(CONFIG.stage2),
+        settings=section(SEARCH),
+        seed=CONFIG.seed,
+        device=CONFIG.device,
+        code=code_digest("model", "priors", "training"),
+    shell:
+        "dine --log {log} --threads {threads} search-lambda --pairs {input.pairs:q}"
+        " --model {input.model:q} {params.priors} --stage2 {params.stage2:q}"
+        " --settings {params.settings:q} --seed {params.seed} --device {params.device}"
+        " --out {output:q}"

@@ -1,0 +1,64 @@
+# Stage 1: the backbone on the data term alone.
+
+
+def backbone_settings(wildcards):
+    backbone = CONFIG.backbones[wildcards.backbone]
+    return json.dumps(
+        {"kind": backbone.kind, "arguments": backbone.arguments}, sort_keys=True
+    )
+
+
+rule stage1:
+    input:
+        pairs=rules.pairs.output,
+    output:
+        model=RESULTS / "{dataset}" / "{backbone}" / "stage1" / "model.safetensors",
+        history=RESULTS / "{dataset}" / "{backbone}" / "stage1" / "history.csv",
+        record=RESULTS / "{dataset}" / "{backbone}" / "stage1" / "run.json",
+    log:
+        LOGS / "{dataset}" / "{backbone}" / "stage1.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "{backbone}" / "stage1.tsv"
+    priority: 10
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        backbone=backbone_settings,
+        settings=section(CONFIG.stage1),
+        seed=CONFIG.seed,
+        device=CONFIG.device,
+        code=code_digest("model", "training"),
+    shell:
+        "dine --log {log} --threads {threads} stage1 --pairs {input.pairs:q}"
+        " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
+        " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/stage1'"
+        " --out $(dirname {output.model:q})"
+
+
+rule fields:
+    input:
+        model=rules.stage1.output.model,
+        pairs=rules.pairs.output,
+    output:
+        RESULTS / "{dataset}" / "{backbone}" / "dvf.h5",
+    log:
+        LOGS / "{dataset}" / "{backbone}" / "fields.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "{backbone}" / "fields.tsv"
+    priority: 20
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        batch=CONFIG.evaluation.batch_size,
+        device=CONFIG.device,
+        code=code_digest("model"),
+    shell:
+        "dine --log {log} --threads {threads} fields --model {input.model:q}"
+        " --pairs {input.pairs:q} --batch-size {params.batch} --device {params.device}"
+        " --name '{wildcards.dataset}/{wildcards.backbone}/fields' --out {output:q}"

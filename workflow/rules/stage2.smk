@@ -1,0 +1,68 @@
+# Stage 2: from Stage 1, with λ times a prior, and the control with λ = 0.
+
+
+def stage2_outputs(variant):
+    folder = RESULTS / "{dataset}" / "{backbone}" / "stage2" / variant
+    return {
+        "model": folder / "model.safetensors",
+        "history": folder / "history.csv",
+        "record": folder / "run.json",
+    }
+
+
+rule stage2_control:
+    input:
+        pairs=rules.pairs.output,
+        model=rules.stage1.output.model,
+    output:
+        **stage2_outputs(dine_config.CONTROL),
+    log:
+        LOGS / "{dataset}" / "{backbone}" / "stage2" / "lambda0.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "lambda0.tsv"
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        settings=section(CONFIG.stage2),
+        seed=CONFIG.seed,
+        device=CONFIG.device,
+        code=code_digest("model", "training"),
+    shell:
+        "dine --log {log} --threads {threads} stage2 --pairs {input.pairs:q}"
+        " --model {input.model:q} --settings {params.settings:q} --seed {params.seed}"
+        " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/lambda0'"
+        " --out $(dirname {output.model:q})"
+
+
+rule stage2_prior:
+    input:
+        pairs=rules.pairs.output,
+        model=rules.stage1.output.model,
+        prior=rules.fit_prior.output,
+        weight=rules.search_lambda.output,
+    output:
+        **stage2_outputs("{prior}"),
+    log:
+        LOGS / "{dataset}" / "{backbone}" / "stage2" / "{prior}.log",
+    benchmark:
+        BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "{prior}.tsv"
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        settings=section(CONFIG.stage2),
+        seed=CONFIG.seed,
+        device=CONFIG.device,
+        code=code_digest("model", "priors", "training"),
+    shell:
+        "dine --log {log} --threads {threads} stage2 --pairs {input.pairs:q}"
+        " --model {input.model:q} --variant {wildcards.prior} --prior {input.prior:q}"
+        " --lambda {input.weight:q} --settings {params.settings:q} --seed {params.seed}"
+        " --device {params.device}"
+        " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior}'"
+        " --out $(dirname {output.model:q})"
