@@ -80,7 +80,7 @@ class Recipe(Section):
     """Shares of control points, in percent of the sampled points."""
     widths: list[Positive] = Field(default=[0.3, 0.4, 0.5], min_length=1)
     """Widths of the Gaussian radial basis function, on objects of unit radius."""
-    amplitude: Positive = 0.25
+    amplitude: Positive = 0.15
     """Standard deviation per coordinate of a control displacement at level 1."""
     pairs_per_level: Count = 1
     """Targets per object and level."""
@@ -241,7 +241,7 @@ class Pretraining(Training):
     data_term: str = "l1"
     steps: Count = 4000
     schedule: Literal["constant", "cosine"] = "cosine"
-    objects: Count = 120
+    objects: Count = 240
     """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
 
 

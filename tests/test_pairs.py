@@ -483,7 +483,7 @@ def test_damage_anywhere_is_noticed(path):
         else:  # a byte of the file that holds nothing
             assert_equal(found, expected)
             assert found.attributes == expected.attributes
-    assert len(messages) > 75
+    assert len(messages) > 130
     assert all(str(path) in message and "delete it" in message for message in messages)
 
 

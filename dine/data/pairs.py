@@ -245,43 +245,24 @@ def make_pairs(
     if points < 1:
         raise ConfigError(f"The number of points must be at least 1, found {points}.")
     fractions = _checked_fractions(split)
-    every = [files for files in inventory.pairs if files.condition == "deformation"]
-    sampler = _Sampler(points, convention, seed)
-    rows: list[dict[str, Any]] = []
-    skipped: list[tuple[str, str]] = []
-    used: list[PairFiles] = []
-    names: set[str] = set()
-    for done, files in enumerate(every, start=1):
-        name = files.name if files.level is None else f"{files.level:g}/{files.name}"
-        try:
-            if name in names:
-                raise DataError(f"{files.target}: another pair is called {name} too; rename one.")
-            names.add(name)
-            row = sampler.pair(files)
-        except DataError as error:
-            skipped.append((name, str(error)))
-        else:
-            row |= {"name": name, "object": files.object, "level": files.level}
-            for role in ("source", "target"):
-                row[f"{role}_file"] = _relative(getattr(files, role), inventory.folder)
-            rows.append(row)
-            used.append(files)
-        if progress is not None:
-            progress(done, len(every))
-    if rows and inventory.split is not None:
-        parts, facts = _published_split(rows, used, inventory.split, fractions, seed)
-        skipped += [
-            (row["name"], "the published split names neither the pair nor its object")
-            for row, part in zip(rows, parts, strict=True)
-            if part is None
-        ]
-    elif rows:
-        by_object = _split_objects({row["object"] for row in rows}, fractions, seed)
+    rows, skipped = _sample_all(inventory, _Sampler(points, convention, seed), progress)
+    if inventory.split is None:
+        objects = {row["object"] for row in rows}
+        # Without any row, the reasons for that say more than the number of objects.
+        by_object = _split_objects(objects, fractions, seed) if rows else {}
         parts = [by_object[row["object"]] for row in rows]
         facts = {"split_rule": "objects", "split_leakage": "", "split_unknown": 0}
+    else:
+        parts, facts = _published_split(rows, inventory.split, fractions, seed)
+    kept = []
+    for row, part in zip(rows, parts, strict=True):
+        if part is None:
+            reason = "the published split names neither the pair nor its object"
+            skipped.append((row["name"], reason))
+        else:
+            kept.append(row | {"split": part})
     for name, reason in skipped:
         _log.warning("Left out pair %s: %s", name, reason)
-    kept = [row | {"split": p} for row, p in zip(rows, parts, strict=True) if p] if rows else []
     if not kept:
         first = f"; the first of {len(skipped)}: {skipped[0][1]}" if skipped else ""
         raise DataError(
@@ -449,6 +430,34 @@ def read_variant(path: str | os.PathLike, pairs: PairSet) -> Variant:
 # --- from files to points ---------------------------------------------------------------------
 
 
+_Row = dict[str, Any]
+
+
+def _sample_all(
+    inventory: Inventory, sampler: _Sampler, progress: Callable[[int, int], None] | None
+) -> tuple[list[_Row], list[tuple[str, str]]]:
+    """All columns but the split, row by row, and the pairs that have none, with reasons."""
+    every = [files for files in inventory.pairs if files.condition == "deformation"]
+    rows, skipped, names = [], [], set()
+    for done, files in enumerate(every, start=1):
+        name = files.name if files.level is None else f"{files.level:g}/{files.name}"
+        try:
+            if name in names:
+                raise DataError(f"{files.target}: another pair is called {name} too; rename one.")
+            names.add(name)
+            row = sampler.pair(files)
+        except DataError as error:
+            skipped.append((name, str(error)))
+        else:
+            row |= {"name": name, "object": files.object, "level": files.level}
+            for role in ("source", "target"):
+                row[f"{role}_file"] = _relative(getattr(files, role), inventory.folder)
+            rows.append(row)
+        if progress is not None:
+            progress(done, len(every))
+    return rows, skipped
+
+
 @dataclass(frozen=True)
 class _Sampled:
     samples: SurfaceSamples
@@ -464,7 +473,7 @@ class _Sampler:
         self.points, self.convention, self.seed = points, convention, seed
         self._known: dict[tuple[str, bytes], _Sampled] = {}
 
-    def pair(self, files: PairFiles) -> dict[str, np.ndarray | float]:
+    def pair(self, files: PairFiles) -> _Row:
         """The columns of one pair that come from its surfaces."""
         if files.level is None:
             raise DataError(
@@ -556,16 +565,14 @@ def _split_objects(objects: set[str], fractions: Mapping[str, float], seed: int)
 
 
 def _published_split(
-    rows: list[dict[str, Any]],
-    used: list[PairFiles],
+    rows: list[_Row],
     published: Mapping[str, str],
     fractions: Mapping[str, float],
     seed: int,
 ) -> tuple[list[str | None], dict[str, str | int]]:
     """Part of each row, None where the split does not name it, and attributes about the split."""
-    candidates = [
-        (row["name"], files.name, files.object) for row, files in zip(rows, used, strict=True)
-    ]
+    # The level is part of an id, but a published split may name files without their folders.
+    candidates = [(row["name"], row["name"].split("/", 1)[1], row["object"]) for row in rows]
     parts = [
         next((published[name] for name in names if name in published), None) for names in candidates
     ]
