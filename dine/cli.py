@@ -170,7 +170,7 @@ def inspect(folder: Path):
 def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
     """Make, find or download raw meshes.
 
-    Example: dine raw --settings '{"source": {"kind": "path", "folder": "scans"}}' --out results/mine
+    Example: dine raw --settings '{"source": {"kind": "path", "folder": "scans"}}' --out mine
     """
     from dine.data.obtain import obtain
 

@@ -7,6 +7,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,8 @@ from typing import Any
 
 from dine.errors import DataError, StorageError
 
+# Less free space than one block of a file system: taken for a full disk when a write failed.
+_FULL_BYTES = 4096
 _STORAGE_ERRNOS = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
@@ -51,8 +54,8 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
             os.fsync(stream.fileno())
         os.replace(temporary, path)
         temporary = None
-    except OSError as error:
-        reason = _storage_reason(error)
+    except Exception as error:
+        reason = _storage_reason(error, path.parent)
         if reason is None:
             raise
         raise StorageError(
@@ -64,13 +67,16 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def _storage_reason(error: OSError) -> str | None:
-    if error.errno in _STORAGE_ERRNOS:
+def _storage_reason(error: Exception, folder: Path) -> str | None:
+    """Why storage refused the write, or None when the error is about something else."""
+    if isinstance(error, OSError) and error.errno in _STORAGE_ERRNOS:
         return _STORAGE_ERRNOS[error.errno]
-    # HDF5 reports a failed write in its message, sometimes without the error number.
-    text = str(error).lower()
-    if "no space left on device" in text or f"errno = {errno.ENOSPC}" in text:
-        return _STORAGE_ERRNOS[errno.ENOSPC]
+    # HDF5 and safetensors put the cause into their message; torch has only its own short count.
+    full = _STORAGE_ERRNOS[errno.ENOSPC]
+    if "no space left on device" in str(error).lower():
+        return full
+    if isinstance(error, RuntimeError | OSError) and folder.is_dir():
+        return full if shutil.disk_usage(folder).free < _FULL_BYTES else None
     return None
 
 

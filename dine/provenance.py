@@ -14,12 +14,20 @@ from dine import __version__
 
 PACKAGE = Path(__file__).parent
 
+_READING = ("data/surface.py", "data/readers.py", "data/layout.py")
+
 LAYERS: dict[str, tuple[str, ...]] = {
     # What a step's result depends on, as paths below the package.
-    "raw": ("data/deformation.py", "data/synthetic.py", "data/raw.py", "data/dataverse.py")
-    + ("data/layout.py", "data/readers.py", "data/surface.py"),
-    "pairs": ("data/readers.py", "data/surface.py", "data/layout.py")
-    + ("data/sampling.py", "data/pairs.py"),
+    "raw": (
+        *_READING,
+        "data/obtain.py",
+        "data/raw.py",
+        "data/synthetic.py",
+        "data/deformation.py",
+        "data/sampling.py",
+        "data/dataverse.py",
+    ),
+    "pairs": (*_READING, "data/prepare.py", "data/pairs.py", "data/sampling.py"),
     "corrupt": ("data/corruption.py", "data/pairs.py"),
     "model": ("data/batch.py", "data/pairs.py", "geometry", "models"),
     "priors": ("priors",),

@@ -178,6 +178,16 @@ def test_making_is_deterministic_and_seeded(inventory, pairs):
     assert make(inventory, seed=4)[0].checksum != pairs.checksum
 
 
+def test_points_are_drawn_anew_for_every_object_and_seed(tmp_path):
+    inventory = build(tmp_path, objects=3, levels=(0.2,))
+    for position in range(3):
+        files = inventory.pairs[0]
+        swap(inventory, position, source=files.source, target=files.target)
+    first, other = (make(inventory, seed=seed, split={"train": 1.0})[0] for seed in (0, 1))
+    weights = [*first.vertex_weight, *other.vertex_weight]
+    assert len(np.unique(weights, axis=0)) == 6
+
+
 def test_a_pair_is_the_same_whichever_others_there_are(inventory, pairs):
     fewer = Inventory(inventory.folder, pairs=inventory.pairs[2:][::-1])
     found, _ = make(fewer)
@@ -371,6 +381,18 @@ def test_validation_objects_are_taken_from_training_objects_that_do_not_leak(inv
         assert sorted(min(parts[i]) for i in "123") == ["train", "train", "val"]
     without, _ = make(published, split={"train": 0.8, "test": 0.2})
     assert set(without.split) == {"train", "test"}
+
+
+def test_published_test_pairs_stay_test_pairs_when_every_training_object_leaks(inventory):
+    split = {
+        f"{level}/{i}_5_0.3": part
+        for level, part in ((0.2, "train"), (0.4, "test"))
+        for i in range(5)
+    }
+    pairs, _ = make(Inventory(inventory.folder, pairs=inventory.pairs, split=split))
+    np.testing.assert_array_equal(pairs.split == "test", pairs.level == 0.4)
+    assert {"train", "val"} == set(pairs.split[pairs.level == 0.2])
+    assert pairs.attributes["split_leakage"] == "0, 1, 2, 3, 4"
 
 
 def test_published_split_that_fits_nothing(inventory):

@@ -107,10 +107,17 @@ def test_sampling_does_not_depend_on_units(unit):
 
 
 def test_triangles_without_area_are_never_drawn():
-    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0.0]])
+    class Extremes:
+        """Draws the two ends of the unit interval, where rounding could pick a neighbour."""
+
+        def random(self, size):
+            return np.resize([0.0, np.nextafter(1, 0)], size)
+
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0.0]]) * 0.7
     surface = Surface(vertices, np.array([[0, 1, 3], [0, 1, 2], [0, 0, 0]]))
-    samples = sample_surface(surface, 200, rng())
-    assert (np.sort(samples.faces_vertices, axis=1) == [0, 1, 2]).all()
+    for draw in (rng(), Extremes()):
+        samples = sample_surface(surface, 200, draw)
+        assert (np.sort(samples.faces_vertices, axis=1) == [0, 1, 2]).all()
 
 
 def test_bad_surfaces_are_refused():

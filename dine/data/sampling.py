@@ -84,14 +84,13 @@ def sample_surface(surface: Surface, points: int, rng: np.random.Generator) -> S
     corners = ((surface.vertices - low) / (size or 1.0))[surface.faces]
     edges = corners[:, 1:] - corners[:, :1]
     reach = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
-    if not reach[-1] > 0:
+    if not reach[-1] > np.finfo(np.float64).tiny:
         raise DataError(
             f"{surface.name}: the {len(surface.faces)} triangles have no area to draw points from; "
             "repair or remove the file."
         )
     # "right" skips triangles without area, whose reach is that of the one before.
     face = np.searchsorted(reach, rng.random(points) * reach[-1], side="right")
-    face = np.minimum(face, np.searchsorted(reach, reach[-1]))
     # Folding the unit square along its diagonal makes the draw uniform within the triangle.
     square = rng.random((points, 2))
     outside = square.sum(axis=1) > 1

@@ -23,9 +23,13 @@ def instance_norm(x: Tensor, mask: Tensor | None = None, slope: float = 1.0) -> 
     """
     if kernels.supported(x):
         return kernels.NormLeakyReLU.apply(x, slope, mask, NORM_EPS)
+    return instance_norm_eager(x, mask, slope)
+
+
+def instance_norm_eager(x: Tensor, mask: Tensor | None = None, slope: float = 1.0) -> Tensor:
+    """:func:`instance_norm` in plain PyTorch, on any device."""
     mean, scale = _statistics(x, mask)
-    x = (x - mean) * scale
-    return x if slope == 1 else F.leaky_relu(x, slope)
+    return F.leaky_relu((x - mean) * scale, slope)
 
 
 def normalised_maximum(x: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -35,12 +39,19 @@ def normalised_maximum(x: Tensor, mask: Tensor | None = None) -> Tensor:
     """
     if kernels.supported(x):
         return kernels.NormMax.apply(x, mask, NORM_EPS)
+    return normalised_maximum_eager(x, mask)
+
+
+def normalised_maximum_eager(x: Tensor, mask: Tensor | None = None) -> Tensor:
+    """:func:`normalised_maximum` in plain PyTorch, on any device."""
     mean, scale = _statistics(x.flatten(1, 2), mask)
     if mask is None:
         return (x.amax(dim=2) - mean) * scale
     mask = mask.view(*x.shape[:3], 1)
-    highest = x.masked_fill(~mask, -torch.inf).amax(dim=2)
-    return ((highest - mean) * scale).masked_fill(~mask.any(dim=2), 0)
+    empty = ~mask.any(dim=2)
+    # Infinities must not meet the scale: its gradient would be NaN.
+    highest = x.masked_fill(~mask, -torch.inf).amax(dim=2).masked_fill(empty, 0)
+    return ((highest - mean) * scale).masked_fill(empty, 0)
 
 
 def _statistics(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -86,7 +97,7 @@ class TNet(nn.Module):
 
 
 class EdgeConv(nn.Module):
-    """Three 1×1 convolutions on edge features [f_j − f_i, f_i], then the maximum over neighbours."""
+    """Three 1×1 convolutions on edge features [f_j − f_i, f_i], then a maximum over neighbours."""
 
     SLOPE = 0.01
 

@@ -303,9 +303,8 @@ def stage2(
 ) -> None:
     """Refine a Stage-1 model with λ times a frozen prior; ``lambda0`` is the control without."""
     if (prior is None) != (variant == CONTROL):
-        raise ConfigError(
-            f"The variant {variant!r} {'needs' if prior is None else 'takes no'} prior."
-        )
+        fault = "needs a prior" if prior is None else "takes no prior"
+        raise ConfigError(f"The variant {variant!r} {fault}.")
     backbone, facts = load_backbone(model)
     _run(
         backbone,
@@ -339,7 +338,7 @@ def search_lambda(
     out: Path,
     device: str = "auto",
 ) -> None:
-    """Try each λ on a shortened Stage 2 and keep the one with the lowest validation Chamfer distance.
+    """Try each λ on a shortened Stage 2; the lowest Chamfer distance on validation pairs wins.
 
     λ = 0 is trained too, once, for comparison, but never chosen. Each candidate's result is kept,
     so that an interrupted search goes on with the next one.

@@ -1,4 +1,4 @@
-# What every rule shares: the checked configuration, paths, names and parameters.
+# Shared by all rules. The checked configuration, paths, names and parameters.
 
 import json
 import shutil
@@ -64,3 +64,54 @@ def variant_files(wildcards):
 
 def method_of(run):
     return run.removeprefix("stage2/")
+
+
+def raw_settings(wildcards):
+    dataset = CONFIG.datasets[wildcards.dataset]
+    # Not the split, nor the convention: changing those does not change the raw files.
+    return json.dumps(
+        {
+            "source": dataset.source.model_dump(exclude_none=True),
+            "recipe": dataset.recipe.model_dump(),
+            "pairs": {"points": dataset.pairs.points},
+        },
+        sort_keys=True,
+    )
+
+
+def raw_signature(wildcards):
+    """Changes when a user's own folder does; Snakemake cannot know which files will be read."""
+    source = CONFIG.datasets[wildcards.dataset].source
+    return (
+        folder_signature(Path(source.folder).expanduser())
+        if source.kind == "path"
+        else ""
+    )
+
+
+def backbone_settings(wildcards):
+    backbone = CONFIG.backbones[wildcards.backbone]
+    return json.dumps(
+        {"kind": backbone.kind, "arguments": backbone.arguments}, sort_keys=True
+    )
+
+
+def prior_settings(wildcards):
+    prior = CONFIG.priors[wildcards.prior]
+    return json.dumps(
+        {"kind": prior.kind, "arguments": dine_config.check_arguments(prior)},
+        sort_keys=True,
+    )
+
+
+def stage2_outputs(variant):
+    folder = RESULTS / "{dataset}" / "{backbone}" / "stage2" / variant
+    return {
+        "model": folder / "model.safetensors",
+        "history": folder / "history.csv",
+        "record": folder / "run.json",
+    }
+
+
+def variant_options(wildcards, input):
+    return " ".join(f"--variant {path}" for path in input.variants)

@@ -1,29 +1,6 @@
 # Raw meshes, index-consistent pairs, corrupted targets.
 
 
-def raw_settings(wildcards):
-    dataset = CONFIG.datasets[wildcards.dataset]
-    # Not the split, nor the convention: changing those does not change the raw files.
-    return json.dumps(
-        {
-            "source": dataset.source.model_dump(exclude_none=True),
-            "recipe": dataset.recipe.model_dump(),
-            "pairs": {"points": dataset.pairs.points},
-        },
-        sort_keys=True,
-    )
-
-
-def raw_signature(wildcards):
-    """Changes when a user's own folder does; Snakemake cannot know which files will be read."""
-    source = CONFIG.datasets[wildcards.dataset].source
-    return (
-        folder_signature(Path(source.folder).expanduser())
-        if source.kind == "path"
-        else ""
-    )
-
-
 rule raw:
     output:
         raw=RESULTS / "{dataset}" / "raw.json",

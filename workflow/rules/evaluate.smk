@@ -1,10 +1,6 @@
 # Predictions first, then metrics from them.
 
 
-def variant_options(wildcards, input):
-    return " ".join(f"--variant {path}" for path in input.variants)
-
-
 rule predict:
     input:
         model=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "model.safetensors",

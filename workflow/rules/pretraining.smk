@@ -3,9 +3,9 @@
 PRETRAINING = RESULTS / "pretraining"
 # Far beyond the numbers that any dataset uses, so that no object is trained on and tested on.
 FIRST_OBJECT = 1_000_000
-RECIPES = {
-    "primitives": ("sphere", [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8]),
-    "tissue": ("disc", [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]),
+LEVELS = {
+    "primitives": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8],
+    "tissue": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7],
 }
 
 
@@ -22,7 +22,7 @@ rule pretraining_raw:
                 "recipe": {
                     "shape": wildcards.shape,
                     "objects": CONFIG.pretraining.objects // 2,
-                    "levels": RECIPES[wildcards.shape][1],
+                    "levels": LEVELS[wildcards.shape],
                 }
             },
             sort_keys=True,
@@ -47,7 +47,7 @@ rule pretraining_pairs:
     params:
         settings=lambda wildcards: json.dumps(
             {
-                "convention": RECIPES[wildcards.shape][0],
+                "convention": "none",  # no prior is fitted to these fields
                 "split": {"train": 0.9, "val": 0.05, "test": 0.05},
             },
             sort_keys=True,
@@ -61,7 +61,7 @@ rule pretraining_pairs:
 
 rule pretrain:
     input:
-        expand(rules.pretraining_pairs.output, shape=RECIPES),
+        expand(rules.pretraining_pairs.output, shape=LEVELS),
     output:
         model=PRETRAINING / "{backbone}" / "model.safetensors",
         history=PRETRAINING / "{backbone}" / "history.csv",

@@ -1,14 +1,6 @@
 # Priors, fitted to Stage-1 fields of the training split and frozen; the search of λ.
 
 
-def prior_settings(wildcards):
-    prior = CONFIG.priors[wildcards.prior]
-    return json.dumps(
-        {"kind": prior.kind, "arguments": dine_config.check_arguments(prior)},
-        sort_keys=True,
-    )
-
-
 rule fit_prior:
     input:
         rules.fields.output,

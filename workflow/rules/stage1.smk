@@ -1,13 +1,6 @@
 # Stage 1: the backbone on the data term alone.
 
 
-def backbone_settings(wildcards):
-    backbone = CONFIG.backbones[wildcards.backbone]
-    return json.dumps(
-        {"kind": backbone.kind, "arguments": backbone.arguments}, sort_keys=True
-    )
-
-
 rule stage1:
     input:
         pairs=rules.pairs.output,

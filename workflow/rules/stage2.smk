@@ -1,15 +1,6 @@
 # Stage 2: from Stage 1, with λ times a prior, and the control with λ = 0.
 
 
-def stage2_outputs(variant):
-    folder = RESULTS / "{dataset}" / "{backbone}" / "stage2" / variant
-    return {
-        "model": folder / "model.safetensors",
-        "history": folder / "history.csv",
-        "record": folder / "run.json",
-    }
-
-
 rule stage2_control:
     input:
         pairs=rules.pairs.output,

@@ -1,0 +1,120 @@
+"""The configuration refuses what cannot work, naming key, value and what was expected."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from dine import config
+from dine.errors import ConfigError
+from dine.results import figure_names, table_names
+
+ROOT = Path(__file__).parents[1]
+DEFAULT = yaml.safe_load((ROOT / "config.yaml").read_text())
+
+
+def changed(path, value):
+    """The default configuration with one key set."""
+    change = value
+    for key in reversed(path.split(".")):
+        change = {key: change}
+    return config.merge(DEFAULT, change)
+
+
+def test_default_is_valid_and_complete():
+    loaded = config.load(ROOT / "config.yaml")
+    assert list(loaded.datasets) == ["deformedtissue", "synbench"]
+    assert loaded.methods("deftransnet") == ["stage1", "lambda0", "pca", "flow"]
+    assert {"table1", "table2", "table3"} <= set(table_names(loaded))
+    assert len(set(figure_names(loaded))) == len(figure_names(loaded))
+
+
+@pytest.mark.parametrize("name", ["tiny", "full"])
+def test_sizes_differ_in_numbers_only(name):
+    change = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text())
+    results = change.pop("results")
+    assert results == f"results/{name}"
+
+    def leaves(value):
+        if isinstance(value, dict):
+            return [leaf for item in value.values() for leaf in leaves(item)]
+        return (
+            [leaf for item in value for leaf in leaves(item)]
+            if isinstance(value, list)
+            else [value]
+        )
+
+    assert all(isinstance(leaf, int | float) for leaf in leaves(change))
+    config.load(ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml")
+
+
+def test_schema_file_is_in_step_with_the_code():
+    stored = json.loads((ROOT / "workflow" / "schemas" / "config.schema.json").read_text())
+    assert stored == config.Config.model_json_schema(), (
+        "run: dine config schema > workflow/schemas/config.schema.json"
+    )
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "match"),
+    [
+        ("stage1.stps", 3, r"`stage1\.stps` is not a known key \(value 3\)"),
+        ("stage1.steps", 0, r"`stage1\.steps` is 0: .*greater than or equal to 1"),
+        ("stage1.steps", "many", r"`stage1\.steps`: expected a number, found the text 'many'"),
+        ("stage1.learning_rate", "1e-4", r"YAML wants 1\.0e-4"),
+        ("stage1.learning_rate", -1.0, r"`stage1\.learning_rate` is -1\.0: .*greater than 0"),
+        ("seed", True, "`seed`: expected a number, found True"),
+        ("device", "gpu", r"`device` is 'gpu': .*'auto', 'cpu' or 'cuda'"),
+        ("datasets.synbench.recipe.levels", [], r"levels` is \[\]"),
+        ("datasets.synbench.recipe.levels", [0.1, "x"], r"levels\.1`: expected a number"),
+        ("datasets.synbench.recipe.pairs_per_level", 10, "only 9 different deformations"),
+        ("datasets.synbench.pairs.convention", "spehre", "'sphere', 'disc', 'lexicographic'"),
+        ("datasets.synbench.pairs.split.train", 0.9, "add up to 1, found 1.2"),
+        ("datasets.synbench.source.kind", "path", "`folder` is needed when `kind` is path"),
+        ("datasets.Bad-Name", {}, "the name 'Bad-Name' under `datasets`"),
+        (
+            "backbones.deftransnet.priors",
+            ["pcaa"],
+            r"`backbones\.deftransnet\.priors` names 'pcaa'",
+        ),
+        ("lambda_search.dataset", "nowhere", r"`lambda_search\.dataset` names 'nowhere'"),
+        ("priors.pca.kind", "pcaa", r"`priors\.pca\.kind` is 'pcaa'; expected one of pca, flow"),
+        (
+            "priors.pca.arguments.componets",
+            3,
+            r"`priors\.pca\.arguments\.componets` is not",
+        ),
+        ("priors.flow.arguments.hidden", 0, r"`priors\.flow\.arguments\.hidden` is 0"),
+        ("priors.lambda0", {"kind": "pca"}, "cannot be called 'lambda0'"),
+    ],
+)
+def test_faults_are_named(path, value, match):
+    with pytest.raises(ConfigError, match=match):
+        config.validate(changed(path, value))
+
+
+def test_all_faults_are_listed_at_once():
+    values = config.merge(changed("stage1.stps", 3), {"seed": -1})
+    with pytest.raises(ConfigError, match=r"stage1\.stps.*;|seed.*;"):
+        config.validate(values)
+
+
+def test_unreadable_files(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        config.load(tmp_path / "none.yaml")
+    (tmp_path / "broken.yaml").write_text("a: [1")
+    with pytest.raises(ConfigError, match="not valid YAML"):
+        config.load(tmp_path / "broken.yaml")
+    (tmp_path / "list.yaml").write_text("- 1")
+    with pytest.raises(ConfigError, match="expected keys and values, found list"):
+        config.load(tmp_path / "list.yaml")
+    (tmp_path / "code.yaml").write_text("seed: !!python/object/apply:os.getpid []")
+    with pytest.raises(ConfigError, match="not valid YAML"):
+        config.load(tmp_path / "code.yaml")
+
+
+def test_a_prior_by_import_path_takes_any_arguments():
+    values = changed("priors.mine", {"kind": "my_package:Prior", "arguments": {"anything": 1}})
+    loaded = config.validate(values)
+    assert config.check_arguments(loaded.priors["mine"]) == {"anything": 1}

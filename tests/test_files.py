@@ -1,0 +1,106 @@
+"""Nothing half-written is ever taken for finished."""
+
+import errno
+import os
+import subprocess
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from dine.errors import DataError, StorageError
+from dine.files import atomic_path, digest, read_json, write_json, write_text
+from dine.models.checkpoint import save_tensors
+
+
+def test_a_failed_write_keeps_the_old_file_and_leaves_nothing(tmp_path):
+    path = tmp_path / "result.txt"
+    write_text(path, "finished work")
+
+    def fail():
+        with atomic_path(path) as temporary:
+            temporary.write_text("half of")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert path.read_text() == "finished work"
+    assert os.listdir(tmp_path) == ["result.txt"]
+
+
+def test_the_temporary_file_keeps_the_suffix_and_parents_are_made(tmp_path):
+    with atomic_path(tmp_path / "new" / "mesh.ply") as temporary:
+        assert temporary.suffix == ".ply"
+        temporary.write_text("x")
+    assert (tmp_path / "new" / "mesh.ply").read_text() == "x"
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
+def test_storage_errors_name_file_and_cause(tmp_path, code):
+    path = tmp_path / "result.txt"
+    write_text(path, "finished work")
+    with pytest.raises(StorageError, match=r"result\.txt: the .*free space"), atomic_path(path):
+        raise OSError(code, "injected")
+    assert path.read_text() == "finished work"
+
+
+def test_other_errors_pass_through(tmp_path):
+    with pytest.raises(IsADirectoryError), atomic_path(tmp_path / "x"):
+        raise IsADirectoryError(errno.EISDIR, "not storage")
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A real file system of 64 KiB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(place)]
+    try:
+        done = subprocess.run(mount, capture_output=True)
+    except FileNotFoundError:
+        pytest.skip("mount is not installed")
+    if done.returncode:
+        pytest.skip("mounting a small file system needs root")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def write_h5(path):
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file["x"] = np.random.default_rng(0).random(100_000)
+
+
+def write_torch(path):
+    with atomic_path(path) as temporary:
+        torch.save({"x": torch.rand(100_000)}, temporary)
+
+
+def write_weights(path):
+    save_tensors(path, {"x": torch.rand(100_000)}, {"format": "test"})
+
+
+@pytest.mark.parametrize(
+    "write", [write_h5, write_torch, write_weights, lambda p: write_text(p, "x" * 10**6)]
+)
+def test_a_full_disk_gives_one_clear_error(small_disk, write):
+    (small_disk / "result").write_text("finished work")
+    with pytest.raises(StorageError, match="the disk is full"):
+        write(small_disk / "result")
+    assert (small_disk / "result").read_text() == "finished work"
+    assert os.listdir(small_disk) == ["result"]
+
+
+def test_json_round_trip_and_errors(tmp_path):
+    write_json(tmp_path / "a.json", {"b": 1.5, "a": [1, 2]})
+    assert read_json(tmp_path / "a.json") == {"a": [1, 2], "b": 1.5}
+    with pytest.raises(DataError, match=r"nothing\.json does not exist"):
+        read_json(tmp_path / "nothing.json")
+    (tmp_path / "cut.json").write_text('{"a": ')
+    with pytest.raises(DataError, match=r"cut\.json is not readable JSON"):
+        read_json(tmp_path / "cut.json")
+
+
+def test_digest_ignores_key_order_but_not_values():
+    assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
+    assert digest({"a": 1}) != digest({"a": 2})

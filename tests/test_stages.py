@@ -1,0 +1,293 @@
+"""The whole chain, from generated meshes to metrics, through the commands a user would call."""
+
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from click.testing import CliRunner
+
+from dine import cli, config
+from dine.data.batch import make_batch
+from dine.data.obtain import obtain
+from dine.data.pairs import read_pairs, read_variant
+from dine.errors import CheckpointError, ConfigError, DataError
+from dine.evaluation.metrics import chamfer
+from dine.files import read_json
+from dine.priors import load_prior
+from dine.training import stages
+from dine.training.objective import DATA_TERMS
+
+STAGE1 = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
+STAGE2 = '{"steps": 2, "validate_every": 2, "validation_pairs": 1}'
+
+
+def dine(*arguments):
+    """Run a command in this process; errors of ours come through as exceptions."""
+    return CliRunner().invoke(cli.cli, list(map(str, arguments)), catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def chain(tmp_path_factory):
+    """One small run of every step."""
+    root = tmp_path_factory.mktemp("run")
+    settings = {
+        "recipe": {"shape": "tissue", "objects": 4, "levels": [0.2, 0.5]},
+        "pairs": {"points": 64},
+    }
+    dine("raw", "--settings", json.dumps(settings), "--seed", 1, "--out", root)
+    pairs = root / "pairs.h5"
+    split = {"train": 0.5, "val": 0.25, "test": 0.25}
+    dine(
+        *("pairs", "--raw", root / "raw.json", "--out", pairs, "--seed", 1),
+        *("--settings", json.dumps({"points": 64, "convention": "disc", "split": split})),
+    )
+    variant = root / "outliers_25.h5"
+    dine(
+        *("corrupt", "--pairs", pairs, "--condition", "outliers", "--level", 25),
+        *("--out", variant),
+    )
+    dine("stage1", "--pairs", pairs, "--settings", STAGE1, "--out", root / "stage1")
+    model = root / "stage1" / "model.safetensors"
+    dine("fields", "--model", model, "--pairs", pairs, "--out", root / "dvf.h5")
+    for name, arguments in (("pca", {"components": 2}), ("flow", {"steps": 5, "hidden": 8})):
+        dine(
+            *("fit-prior", "--fields", root / "dvf.h5", "--out", root / f"{name}.safetensors"),
+            *("--settings", json.dumps({"kind": name, "arguments": arguments})),
+        )
+    dine(
+        *("search-lambda", "--pairs", pairs, "--model", model, "--out", root / "lambda.json"),
+        *("--prior", "pca", root / "pca.safetensors", "--stage2", STAGE2),
+        *("--settings", '{"candidates": [0.001, 0.1], "steps": 2, "validation_pairs": 1}'),
+    )
+    return root
+
+
+def test_stage1_writes_weights_history_and_record(chain):
+    record = read_json(chain / "stage1" / "run.json")
+    assert record["settings"]["steps"] == 3
+    assert record["seed"] == 0
+    assert record["train_pairs"] == 4
+    assert record["device"] in ("cpu", "cuda")
+    assert {"dine", "torch", "python"} <= set(record["versions"])
+    history = pd.read_csv(chain / "stage1" / "history.csv")
+    assert history["step"].tolist() == [1, 2, 3]
+    assert history["val_cd"].notna().tolist() == [False, False, True]
+
+
+def test_fields_are_the_models_own_on_the_training_split(chain):
+    fields = stages.read_fields(chain / "dvf.h5")
+    train = read_pairs(chain / "pairs.h5", split="train")
+    backbone, _ = stages.load_backbone(chain / "stage1" / "model.safetensors")
+    again = stages.predict_fields(backbone, train, name="again", batch_size=1)
+    assert fields.shape == train.source.shape
+    # Batched or alone, and whatever the order of the target's points.
+    assert np.abs(fields - again).max() < 1e-4
+
+
+def test_lambda_is_the_best_candidate_on_validation_pairs(chain):
+    result = read_json(chain / "lambda.json")
+    curve = pd.DataFrame(result["curve"])
+    assert sorted(curve["lambda"]) == [0, 0.001, 0.1]
+    tried = curve[curve["lambda"] > 0]
+    assert result["selected"]["pca"] == tried.loc[tried["cd"].idxmin(), "lambda"]
+    assert stages.selected_lambda(chain / "lambda.json", "pca") == result["selected"]["pca"]
+    # A prior without a search of its own takes the default's.
+    assert stages.selected_lambda(chain / "lambda.json", "flow") == result["selected"]["pca"]
+
+
+def run_stage2(chain, out, *arguments):
+    dine(
+        *("stage2", "--pairs", chain / "pairs.h5", "--settings", STAGE2, "--out", out),
+        *("--model", chain / "stage1" / "model.safetensors", *arguments),
+    )
+    return read_json(out / "run.json"), (out / "model.safetensors").read_bytes()
+
+
+def test_stage2_and_its_control(chain, tmp_path):
+    prior = ("--prior", chain / "pca.safetensors", "--variant", "pca")
+    control, control_weights = run_stage2(chain, tmp_path / "control")
+    strong, strong_weights = run_stage2(chain, tmp_path / "pca", *prior, "--lambda", "0.5")
+    assert control["lambda"] == 0
+    assert strong["lambda"] == 0.5
+    assert control_weights != strong_weights
+    # Same start, same first batch: the first data terms agree, and the penalty comes on top.
+    first = {
+        name: pd.read_csv(tmp_path / name / "history.csv").iloc[0] for name in ("control", "pca")
+    }
+    assert first["control"]["data"] == first["pca"]["data"]
+    assert first["control"]["penalty"] == 0
+    expected = first["pca"]["data"] + 0.5 * first["pca"]["penalty"]
+    assert first["pca"]["loss"] == pytest.approx(expected, rel=1e-5)
+    # λ from the file of the search.
+    found, _ = run_stage2(chain, tmp_path / "file", *prior, "--lambda", chain / "lambda.json")
+    assert found["lambda"] == read_json(chain / "lambda.json")["selected"]["pca"]
+
+
+def test_equal_runs_give_equal_bytes(chain, tmp_path):
+    dine("stage1", "--pairs", chain / "pairs.h5", "--settings", STAGE1, "--out", tmp_path)
+    first = (chain / "stage1" / "model.safetensors").read_bytes()
+    assert (tmp_path / "model.safetensors").read_bytes() == first
+
+
+def test_predictions_and_metrics(chain, tmp_path):
+    model, pairs = chain / "stage1" / "model.safetensors", chain / "pairs.h5"
+    variant = ("--variant", chain / "outliers_25.h5")
+    dine("predict", "--model", model, "--pairs", pairs, *variant, "--out", tmp_path / "p.h5")
+    dine(
+        *("evaluate", "--predictions", tmp_path / "p.h5", "--pairs", pairs, *variant),
+        *("--dataset", "d", "--backbone", "robust_defreg", "--method", "stage1"),
+        *("--point-errors", tmp_path / "e.h5", "--out", tmp_path / "m.csv"),
+    )
+    metrics = pd.read_csv(tmp_path / "m.csv")
+    test = read_pairs(pairs, split="test")
+    assert metrics["condition"].tolist() == ["deformation"] * 2 + ["outliers"] * 2
+    assert (metrics["origin"] == "synthetic").all()
+    observed = read_variant(chain / "outliers_25.h5", test).target
+    with h5py.File(tmp_path / "p.h5") as file, h5py.File(tmp_path / "e.h5") as errors:
+        for row, (key, index) in enumerate([("deformation", 0), ("outliers_25", 1)]):
+            line = metrics.iloc[3 * row]
+            moved = test.source[index] + file[key]["displacement"][index]
+            clean = test.target[index]
+            assert line["cd"] == pytest.approx(chamfer(moved, clean), rel=1e-4)
+            error = np.linalg.norm(moved - clean, axis=1).mean()
+            assert line["mce"] == pytest.approx(error, rel=1e-4)
+            nearest = errors[key]["squared_distance"][index].mean()
+            assert nearest == pytest.approx(
+                np.mean([np.min(np.sum((clean - p) ** 2, axis=1)) for p in moved]), rel=1e-3
+            )
+        assert metrics.iloc[3]["cd_observed"] == pytest.approx(
+            chamfer(moved, observed[1]), rel=1e-4
+        )
+    assert metrics.iloc[0]["cd_observed"] == metrics.iloc[0]["cd"]
+    unregistered = chamfer(test.source[0], test.target[0])
+    assert metrics.iloc[0]["cd_unregistered"] == pytest.approx(unregistered, rel=1e-4)
+
+
+def test_metrics_agree_with_the_training_loss():
+    a = np.random.default_rng(0).random((30, 3))
+    b = np.random.default_rng(1).random((40, 3))
+    batch = make_batch([a], [b], dtype=torch.float64)
+    loss = DATA_TERMS.get("chamfer")()(batch, torch.zeros(1, 30, 3), None)
+    assert chamfer(a, b) == pytest.approx(loss.item(), rel=1e-9)
+
+
+def damaged(path, tmp_path):
+    copy = tmp_path / path.name
+    data = path.read_bytes()
+    copy.write_bytes(data[: len(data) // 2])
+    return copy
+
+
+def test_truncated_inputs_are_named(chain, tmp_path):
+    model, pairs = chain / "stage1" / "model.safetensors", chain / "pairs.h5"
+    with pytest.raises(DataError, match=r"pairs\.h5"):
+        dine("stage1", "--pairs", damaged(pairs, tmp_path), "--out", tmp_path / "x")
+    with pytest.raises(CheckpointError, match=r"model\.safetensors"):
+        dine(
+            *("fields", "--model", damaged(model, tmp_path), "--pairs", pairs),
+            *("--out", tmp_path / "x.h5"),
+        )
+    with pytest.raises(DataError, match=r"dvf\.h5"):
+        dine("fit-prior", "--fields", damaged(chain / "dvf.h5", tmp_path), "--out", tmp_path / "x")
+    with pytest.raises(CheckpointError, match=r"pca\.safetensors"):
+        load_prior(damaged(chain / "pca.safetensors", tmp_path))
+    with pytest.raises(DataError, match=r"lambda\.json"):
+        stages.selected_lambda(damaged(chain / "lambda.json", tmp_path), "pca")
+    with pytest.raises(DataError, match=r"not the result of `dine search-lambda`"):
+        stages.selected_lambda(chain / "raw.json", "pca")
+    assert not (tmp_path / "x").exists()
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_a_prior_needs_a_weight_and_a_variant_a_prior(chain, tmp_path):
+    start = ("stage2", "--pairs", chain / "pairs.h5", "--out", tmp_path)
+    model = ("--model", chain / "stage1" / "model.safetensors")
+    with pytest.raises(ConfigError, match="--lambda is needed"):
+        dine(*start, *model, "--prior", chain / "pca.safetensors", "--variant", "pca")
+    with pytest.raises(ConfigError, match="'pca' needs a prior"):
+        dine(*start, *model, "--variant", "pca")
+
+
+def test_training_can_start_from_given_weights(chain, tmp_path):
+    start = chain / "stage1" / "model.safetensors"
+    settings = json.loads(STAGE1) | {"start": str(start), "steps": 1}
+    dine(
+        "stage1",
+        "--pairs",
+        chain / "pairs.h5",
+        "--settings",
+        json.dumps(settings),
+        "--out",
+        tmp_path,
+    )
+    first = pd.read_csv(tmp_path / "history.csv")["loss"][0]
+    random = pd.read_csv(chain / "stage1" / "history.csv")["loss"][0]
+    assert first != random
+    with pytest.raises(CheckpointError, match="asks for deftransnet"):
+        dine(
+            *("stage1", "--pairs", chain / "pairs.h5", "--settings", json.dumps(settings)),
+            *("--backbone", '{"kind": "deftransnet"}', "--out", tmp_path / "other"),
+        )
+
+
+@pytest.mark.parametrize("kind", ["robust_defreg", "deftransnet"])
+def test_shipped_weights_load(kind):
+    backbone = stages.starting_backbone(kind, {}, "pretrained", seed=0)
+    assert backbone.registered_name == kind
+
+
+def test_a_folder_of_undeformed_meshes_becomes_a_dataset(chain, tmp_path):
+    meshes = tmp_path / "scans with spaces"
+    shutil.copytree(chain / "raw" / "Data", meshes)
+    (meshes / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\n")
+    dataset = config.validate_section(
+        config.Dataset,
+        {
+            "source": {"kind": "path", "folder": str(meshes)},
+            "recipe": {"levels": [0.3]},
+            "pairs": {"points": 64},
+        },
+        "test",
+    )
+    obtain(dataset, tmp_path / "out", seed=0)
+    facts = read_json(tmp_path / "out" / "raw.json")
+    assert facts["origin"] == "bases"
+    inventory = pd.read_csv(tmp_path / "out" / "inventory.csv")
+    assert inventory["pairs"].tolist() == [4]
+    assert "broken" in (tmp_path / "out" / "raw" / "provenance.json").read_text()
+
+
+def test_a_folder_in_the_published_layout_is_used_as_it_is(chain, tmp_path):
+    dataset = config.Dataset(source={"kind": "path", "folder": str(chain / "raw")})
+    obtain(dataset, tmp_path, seed=0)
+    assert read_json(tmp_path / "raw.json") == {"folder": str(chain / "raw"), "origin": "path"}
+    listed = dine("inspect", chain / "raw").output
+    assert "deformation" in listed
+    assert "0.5" in listed
+    assert "left out" in listed
+
+
+def test_main_prints_one_line_for_a_users_error(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr("sys.argv", ["dine", "inspect", str(tmp_path / "none")])
+    with pytest.raises(SystemExit) as exit_:
+        cli.main()
+    assert exit_.value.code == 1
+    error = capsys.readouterr().err
+    assert "Error:" in error
+    assert "Traceback" not in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_settings_from_a_file_and_bad_settings(chain, tmp_path):
+    (tmp_path / "s.yaml").write_text("steps: 1\nvalidate_every: 1\nvalidation_pairs: 1\n")
+    out = tmp_path / "run"
+    dine("stage1", "--pairs", chain / "pairs.h5", "--settings", f"@{tmp_path}/s.yaml", "--out", out)
+    assert read_json(out / "run.json")["settings"]["steps"] == 1
+    with pytest.raises(ConfigError, match="`stps` is not a known key"):
+        dine("stage1", "--pairs", chain / "pairs.h5", "--settings", '{"stps": 1}', "--out", out)
+    with pytest.raises(ConfigError, match="neither JSON nor @FILE"):
+        dine("stage1", "--pairs", chain / "pairs.h5", "--settings", "steps=1", "--out", out)

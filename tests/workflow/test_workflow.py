@@ -1,0 +1,205 @@
+"""The workflow as a user runs it: one tiny run of everything, then what each change reruns."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+TINY = ROOT / "config" / "tiny.yaml"
+
+
+def snakemake(folder, *arguments, check=True):
+    done = subprocess.run(
+        [sys.executable, "-m", "snakemake", "-j2", *map(str, arguments)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+    if check and done.returncode:
+        raise AssertionError(done.stdout[-3000:] + done.stderr[-3000:])
+    return done
+
+
+def copy_workflow(folder):
+    """The workflow's files without results or Snakemake's own records."""
+    for name in ("Snakefile", "config.yaml"):
+        shutil.copy(ROOT / name, folder)
+    for name in ("workflow", "config", "profiles"):
+        shutil.copytree(ROOT / name, folder / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = copy_workflow(tmp_path_factory.mktemp("workflow run"))
+    snakemake(folder, "all", "--configfile", TINY)
+    return folder
+
+
+def planned(folder, *arguments):
+    """Number of jobs by rule that a dry run would start; nothing for a finished target."""
+    output = snakemake(folder, "-n", *arguments).stdout
+    table = output.partition("Job stats:")[2].partition("\n\n")[0]
+    jobs = dict(re.findall(r"^(\w+)\s+(\d+)$", table, re.MULTILINE))
+    jobs.pop("total", None)
+    return {rule: int(count) for rule, count in jobs.items()}
+
+
+def changed(folder, changes):
+    """Arguments for a run of everything with some settings changed."""
+    path = folder / "changes.yaml"
+    path.write_text(yaml.safe_dump(changes))
+    return ("all", "--configfile", TINY, path)
+
+
+def test_everything_is_there(finished):
+    results = finished / "results" / "tiny"
+    tables = {path.stem for path in (results / "tables").glob("*.csv")}
+    assert {"table1", "table2", "table3", "gains_synbench", "correspondence_synbench"} <= tables
+    for table in tables:
+        assert (results / "tables" / f"{table}.md").stat().st_size > 0
+        assert (results / "tables" / f"{table}.tex").stat().st_size > 0
+    assert len(list((results / "figures").glob("*.png"))) == 25
+    report = (results / "report.html").read_text()
+    assert "synthetic" in report
+    assert not re.search(r"(src|href)=.https?:", report)
+    resolved = yaml.safe_load((results / "config.yaml").read_text())
+    assert resolved["stage1"]["steps"] == 12
+
+
+def test_tables_follow_from_the_metrics(finished):
+    results = finished / "results" / "tiny"
+    table = pd.read_csv(results / "tables" / "table2.csv")
+    metrics = pd.read_csv(results / "synbench" / "deftransnet" / "stage2" / "flow" / "metrics.csv")
+    row = table[(table["backbone"] == "deftransnet") & (table["method"] == "flow")]
+    row = row[row["level"] == 0.6].iloc[0]
+    expected = 1e4 * metrics.loc[metrics["level"] == 0.6, "cd"].mean()
+    assert row["mean_1e-4"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_every_run_has_its_control(finished):
+    results = finished / "results" / "tiny"
+    for dataset in ("synbench", "deformedtissue"):
+        for backbone in ("robust_defreg", "deftransnet"):
+            folder = results / dataset / backbone / "stage2"
+            control = json.loads((folder / "lambda0" / "run.json").read_text())
+            prior = json.loads((folder / "pca" / "run.json").read_text())
+            assert control["lambda"] == 0 < prior["lambda"]
+            for key in ("seed", "settings", "train_pairs"):
+                assert control[key] == prior[key]
+            assert control["inputs"]["model"] == prior["inputs"]["model"]
+
+
+def test_a_second_run_has_nothing_to_do(finished):
+    done = snakemake(finished, "all", "--configfile", TINY)
+    assert "Nothing to be done" in done.stdout + done.stderr
+
+
+REPORTING = {"resolved_config", "tables", "figures", "html", "all"}
+
+CHANGES = {
+    "flow": (
+        {"priors": {"flow": {"arguments": {"steps": 51}}}},
+        {"fit_prior": 2, "stage2_prior": 2, "predict": 2, "evaluate": 2},
+    ),
+    # λ is searched with the PCA prior, so its Stage 2 runs, and those that take its λ, follow.
+    "pca": (
+        {"priors": {"pca": {"arguments": {"shrinkage": 0.1}}}},
+        {"fit_prior": 4, "search_lambda": 1, "stage2_prior": 6, "predict": 6, "evaluate": 6},
+    ),
+    "stage 2": (
+        {"stage2": {"steps": 7}},
+        {
+            "search_lambda": 1,
+            "stage2_control": 4,
+            "stage2_prior": 6,
+            "predict": 10,
+            "evaluate": 10,
+        },
+    ),
+    "one more noise level": (
+        {"datasets": {"deformedtissue": {"corruption": {"noise": [0.03, 0.05]}}}},
+        {"corrupt": 1, "predict": 7, "evaluate": 7},
+    ),
+    "one dataset": (
+        {"datasets": {"deformedtissue": {"pairs": {"convention": "none"}}}},
+        {
+            "pairs": 1,
+            "agreement": 1,
+            "corrupt": 2,
+            "stage1": 2,
+            "fields": 2,
+            "fit_prior": 3,
+            "stage2_control": 2,
+            "stage2_prior": 3,
+            "predict": 7,
+            "evaluate": 7,
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_reruns_what_depends_on_it(finished, change):
+    settings, expected = CHANGES[change]
+    jobs = planned(finished, *changed(finished, settings))
+    assert {rule: n for rule, n in jobs.items() if rule not in REPORTING} == expected
+
+
+def test_one_ablation_uses_what_is_cached(finished):
+    assert planned(finished, "prior_flow", "--configfile", TINY) == {"prior_flow": 1}
+    snakemake(finished, "prior_flow", "--configfile", TINY)
+    table = (finished / "results" / "tiny" / "ablation" / "flow" / "all.md").read_text()
+    assert "DINE-Flow" in table
+    assert "DINE-PCA" not in table
+
+
+def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
+    jobs = planned(copy_workflow(tmp_path), "prior_flow", "--configfile", TINY)
+    # Four Stage-2 runs on DefTransNet; of Robust-DefReg only what the search of λ needs.
+    assert jobs["stage1"] == 3
+    assert (jobs["stage2_control"], jobs["stage2_prior"]) == (2, 2)
+    assert jobs["fit_prior"] == 3
+    assert "figures" not in jobs
+    assert "html" not in jobs
+
+
+def test_a_finished_model_is_restored_bit_for_bit(finished):
+    model = finished / "results/tiny/synbench/robust_defreg/stage1/model.safetensors"
+    before = model.read_bytes()
+    state = model.parent / "training" / "state.pt"
+    assert state.is_file()
+    # As if the job had been killed before its end: no outputs, and no usable state.
+    model.unlink()
+    state.unlink()
+    snakemake(finished, model.relative_to(finished), "--configfile", TINY)
+    assert model.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"stage1": {"stps": 5}}, "`stage1.stps` is not a known key"),
+        ({"backbones": {"deftransnet": {"priors": ["pcaa"]}}}, "names 'pcaa'"),
+        ({"seed": "zero"}, "`seed`: expected a number"),
+    ],
+)
+def test_a_config_typo_stops_before_anything_runs(tmp_path, changes, match):
+    folder = copy_workflow(tmp_path)
+    done = snakemake(folder, *changed(folder, changes), check=False)
+    assert done.returncode != 0
+    assert match in done.stdout + done.stderr
+    assert not (folder / "results").exists()
+
+
+def test_the_dag_can_be_drawn(tmp_path):
+    folder = copy_workflow(tmp_path)
+    assert snakemake(folder, "all", "--dag").stdout.startswith("digraph")
+    assert "stage2_prior" in snakemake(folder, "all", "--rulegraph", "mermaid-js").stdout
