@@ -19,6 +19,9 @@ CONTROL = "lambda0"
 
 STAGE1 = "stage1"
 
+NAMED = ("datasets", "backbones", "priors")
+"""Sections whose keys are names of the user's choice."""
+
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
 
 
@@ -267,7 +270,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _references(self):
-        for section in ("datasets", "backbones", "priors"):
+        for section in NAMED:
             for name in getattr(self, section):
                 if not _NAME.match(name):
                     raise ValueError(
@@ -342,9 +345,19 @@ def explain(error: ValidationError, where: str = "") -> str:
 def validate(values: Any, where: str = "the configuration") -> Config:
     """Check a mapping and fill in defaults.
 
+    A dataset, backbone or prior that is null is left out: that is how a file laid over another one
+    takes entries away.
+
     Raises:
         ConfigError: every fault, with key, value and what was expected.
     """
+    if isinstance(values, dict):
+        values = {
+            key: {name: entry for name, entry in section.items() if entry is not None}
+            if key in NAMED and isinstance(section, dict)
+            else section
+            for key, section in values.items()
+        }
     return validate_section(Config, values, where)
 
 

@@ -100,6 +100,13 @@ def test_all_faults_are_listed_at_once():
         config.validate(values)
 
 
+def test_null_takes_an_entry_away():
+    values = changed("datasets.deformedtissue", None)
+    assert list(config.validate(values).datasets) == ["synbench"]
+    with pytest.raises(ConfigError, match=r"lambda_search\.dataset` names 'synbench'"):
+        config.validate(changed("datasets.synbench", None))
+
+
 def test_unreadable_files(tmp_path):
     with pytest.raises(ConfigError, match="cannot be read"):
         config.load(tmp_path / "none.yaml")

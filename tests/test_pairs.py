@@ -10,16 +10,17 @@ import pytest
 import trimesh
 
 import dine.data.pairs as module
+import dine.data.prepare as making
 from dine.data.layout import Inventory, PairFiles
 from dine.data.pairs import (
     PairSet,
-    make_pairs,
     make_variant,
     read_pairs,
     read_variant,
     write_pairs,
     write_variant,
 )
+from dine.data.prepare import make_pairs
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
@@ -151,9 +152,9 @@ def test_normalised_pairs_do_not_depend_on_units_or_position(tmp_path, pairs, tr
 
 def test_targets_of_one_object_share_source_points_sampled_once(inventory, monkeypatch):
     calls = []
-    order = module.convention_order
+    order = making.convention_order
     monkeypatch.setattr(
-        module, "convention_order", lambda *args: calls.append(args) or order(*args)
+        making, "convention_order", lambda *args: calls.append(args) or order(*args)
     )
     pairs, _ = make(inventory)
     assert len(calls) == 5
@@ -322,7 +323,7 @@ def test_split_is_shuffled_by_seed_and_independent_of_the_number_of_pairs(invent
 
 
 def test_fractions_are_followed():
-    share = module._split_objects
+    share = making._split_objects
     parts = list(
         share(set(map(str, range(100))), {"train": 0.7, "val": 0.1, "test": 0.2}, 0).values()
     )

@@ -1,15 +1,32 @@
-"""From raw files to a pairs file, and how well the index convention holds in it."""
+"""From raw files to pairs, and how well the index convention holds in them."""
 
 from __future__ import annotations
 
+import hashlib
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dine.config import Pairs
+from dine.data.layout import Inventory, PairFiles, check_pair
 from dine.data.obtain import obtained
-from dine.data.pairs import make_pairs, read_pairs, write_pairs
-from dine.data.sampling import neighbourhood_agreement
+from dine.data.pairs import PAIR_DATASETS, SPLITS, PairSet, keyed_rng, read_pairs, write_pairs
+from dine.data.readers import read_surface
+from dine.data.sampling import (
+    SurfaceSamples,
+    convention_order,
+    neighbourhood_agreement,
+    sample_surface,
+)
+from dine.data.surface import Surface
+from dine.errors import ConfigError, DataError
+from dine.files import digest
+
+_log = logging.getLogger(__name__)
 
 
 def prepare_pairs(raw: Path, settings: Pairs, *, seed: int, out: Path) -> None:
@@ -36,3 +53,273 @@ def measure_agreement(path: Path, *, seed: int) -> dict[str, object]:
     _, first = np.unique(pairs.object, return_index=True)
     found = neighbourhood_agreement(pairs.source[np.sort(first)], rng=np.random.default_rng(seed))
     return {"convention": str(pairs.attributes["convention"]), **found}
+
+
+def make_pairs(
+    inventory: Inventory,
+    *,
+    points: int,
+    convention: str,
+    split: Mapping[str, float],
+    seed: int,
+    origin: str = "files",
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[PairSet, list[tuple[str, str]]]:
+    """Sample the pairs of condition ``deformation`` and split them by base object.
+
+    Points are drawn on the source and carried to the target. The draw is keyed by seed and object,
+    and the convention is computed once for each distinct undeformed surface, so that all targets of
+    an object share points and order.
+
+    Without a published split, objects are shuffled by ``seed`` and shared out by fraction, at least
+    one to each split whose fraction is not zero. A published split (``inventory.split``) is kept as
+    it is: by pair name where it has that, otherwise by object; objects in two of its parts are
+    logged and kept. Where it has no ``val``, some of its training objects become ``val``.
+
+    Attributes of the result: ``seed``, ``convention``, ``points``, ``origin``, ``split_rule``
+    (``objects`` or ``published``), ``split_train``, ``split_val``, ``split_test`` (the fractions),
+    ``split_leakage`` (objects in two parts of a published split, separated by commas),
+    ``split_unknown`` (number of names in a published split that fit nothing), ``checksum``.
+
+    Args:
+        inventory: what ``dine.data.layout.scan`` found.
+        points: N, points per cloud.
+        convention: see ``dine.data.sampling.convention_order``.
+        split: fractions of objects for ``train``, ``val`` and ``test``; they sum to 1.
+        seed: >= 0.
+        origin: where the data come from, such as ``"synthetic"``.
+        progress: called with the numbers of pairs done and of all pairs.
+
+    Returns:
+        The pairs, grouped by split, and (id, reason) of every pair that was left out.
+
+    Raises:
+        ConfigError: unusable fractions, number of points or convention.
+        DataError: no usable pair, or too few objects for the splits.
+    """
+    if points < 1:
+        raise ConfigError(f"The number of points must be at least 1, found {points}.")
+    fractions = _checked_fractions(split)
+    rows, skipped = _sample_all(inventory, _Sampler(points, convention, seed), progress)
+    if inventory.split is None:
+        objects = {row["object"] for row in rows}
+        # Without any row, the reasons for that say more than the number of objects.
+        by_object = _split_objects(objects, fractions, seed) if rows else {}
+        parts = [by_object[row["object"]] for row in rows]
+        facts = {"split_rule": "objects", "split_leakage": "", "split_unknown": 0}
+    else:
+        parts, facts = _published_split(rows, inventory.split, fractions, seed)
+    kept = []
+    for row, part in zip(rows, parts, strict=True):
+        if part is None:
+            reason = "the published split names neither the pair nor its object"
+            skipped.append((row["name"], reason))
+        else:
+            kept.append(row | {"split": part})
+    for name, reason in skipped:
+        _log.warning("Left out pair %s: %s", name, reason)
+    if not kept:
+        first = f"; the first of {len(skipped)}: {skipped[0][1]}" if skipped else ""
+        raise DataError(
+            f"{inventory.folder} holds no usable pair of a source and its deformed target{first}"
+        )
+    # Reading one split is then reading one run of rows.
+    kept.sort(key=lambda row: SPLITS.index(row["split"]))
+    pairs = PairSet(
+        **{column: np.array([row[column] for row in kept]) for column in PAIR_DATASETS},
+        attributes={
+            "seed": int(seed),
+            "convention": convention,
+            "points": int(points),
+            "origin": origin,
+            **facts,
+            **{f"split_{part}": fraction for part, fraction in fractions.items()},
+        },
+    )
+    pairs.attributes["checksum"] = pairs.checksum
+    return pairs, skipped
+
+
+# --- from files to points ---------------------------------------------------------------------
+
+
+_Row = dict[str, Any]
+
+
+def _sample_all(
+    inventory: Inventory, sampler: _Sampler, progress: Callable[[int, int], None] | None
+) -> tuple[list[_Row], list[tuple[str, str]]]:
+    """All columns but the split, row by row, and the pairs that have none, with reasons."""
+    every = [files for files in inventory.pairs if files.condition == "deformation"]
+    rows, skipped, names = [], [], set()
+    for done, files in enumerate(every, start=1):
+        name = files.name if files.level is None else f"{files.level:g}/{files.name}"
+        try:
+            if name in names:
+                raise DataError(f"{files.target}: another pair is called {name} too; rename one.")
+            names.add(name)
+            row = sampler.pair(files)
+        except DataError as error:
+            skipped.append((name, str(error)))
+        else:
+            row |= {"name": name, "object": files.object, "level": files.level}
+            for role in ("source", "target"):
+                row[f"{role}_file"] = _relative(getattr(files, role), inventory.folder)
+            rows.append(row)
+        if progress is not None:
+            progress(done, len(every))
+    return rows, skipped
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    samples: SurfaceSamples
+    source: np.ndarray
+    center: np.ndarray
+    scale: float
+
+
+class _Sampler:
+    """Samples pairs, and each distinct undeformed surface of an object only once."""
+
+    def __init__(self, points: int, convention: str, seed: int):
+        self.points, self.convention, self.seed = points, convention, seed
+        self._known: dict[tuple[str, bytes], _Sampled] = {}
+
+    def pair(self, files: PairFiles) -> _Row:
+        """The columns of one pair that come from its surfaces."""
+        if files.level is None:
+            raise DataError(
+                f"{files.target} has no deformation level in its path; put it into a folder named "
+                "after the level, such as Deformation_Level/0.3."
+            )
+        source, target = read_surface(files.source), read_surface(files.target)
+        check_pair(source, target, files.name)
+        sampled = self._sampled(files.object, source)
+        with np.errstate(over="ignore"):
+            moved = (sampled.samples.carry(target.vertices) - sampled.center) / sampled.scale
+            moved = moved.astype(np.float32)
+        if not np.isfinite(moved).all():
+            raise DataError(
+                f"{files.target} lies too far from its source to be given in its frame; check the "
+                "units of both."
+            )
+        return {
+            "source": sampled.source,
+            "target": moved,
+            "center": sampled.center,
+            "scale": sampled.scale,
+            "vertex_index": sampled.samples.faces_vertices.astype(np.int32),
+            "vertex_weight": sampled.samples.weights,
+        }
+
+    def _sampled(self, name: str, surface: Surface) -> _Sampled:
+        faces = b"" if surface.faces is None else surface.faces.tobytes()
+        key = (name, hashlib.sha256(surface.vertices.tobytes() + faces).digest())
+        if key not in self._known:
+            self._known[key] = self._sample(name, surface)
+        return self._known[key]
+
+    def _sample(self, name: str, surface: Surface) -> _Sampled:
+        # Not keyed by the coordinates, so that a change of units or position changes no draw.
+        rng = keyed_rng(self.seed, name)
+        samples = sample_surface(surface, self.points, rng)
+        points = samples.carry(surface.vertices)
+        center = points.mean(axis=0)
+        scale = float(np.linalg.norm(points - center, axis=1).max())
+        if not scale > 0:
+            raise DataError(f"{surface.name}: all sampled points coincide; repair or remove it.")
+        points = (points - center) / scale
+        order = convention_order(points, self.convention)
+        return _Sampled(samples[order], points[order].astype(np.float32), center, scale)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    path = Path(path)
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
+
+
+# --- splits -----------------------------------------------------------------------------------
+
+
+def _checked_fractions(split: Mapping[str, float]) -> dict[str, float]:
+    unknown = sorted(set(split) - set(SPLITS))
+    fractions = {part: float(split.get(part, 0.0)) for part in SPLITS}
+    values = np.array(list(fractions.values()))
+    if unknown or not (values >= 0).all() or not np.isclose(values.sum(), 1.0):
+        raise ConfigError(
+            "The split needs fractions for train, val and test that are not negative and sum to "
+            f"1, found {dict(split)}."
+        )
+    return fractions
+
+
+def _split_objects(objects: set[str], fractions: Mapping[str, float], seed: int) -> dict[str, str]:
+    """Share objects out by fraction, with at least one to each part that is not to be empty."""
+    wanted = {part: fraction for part, fraction in fractions.items() if fraction > 0}
+    if len(objects) < len(wanted):
+        raise DataError(
+            f"Splitting by object into {', '.join(wanted)} needs at least {len(wanted)} objects "
+            f"with usable pairs, found {len(objects)}; provide more objects, or set the share of a "
+            "split to 0."
+        )
+    counts = dict.fromkeys(wanted, 1)
+    for _ in range(len(objects) - len(wanted)):
+        # The next object goes to the part that is farthest below its share.
+        part = max(wanted, key=lambda part: wanted[part] * len(objects) - counts[part])
+        counts[part] += 1
+    shuffled = sorted(objects, key=lambda name: digest([seed, "split", name]))
+    parts = [part for part, count in counts.items() for _ in range(count)]
+    return dict(zip(shuffled, parts, strict=True))
+
+
+def _published_split(
+    rows: list[_Row],
+    published: Mapping[str, str],
+    fractions: Mapping[str, float],
+    seed: int,
+) -> tuple[list[str | None], dict[str, str | int]]:
+    """Part of each row, None where the split does not name it, and attributes about the split."""
+    # The level is part of an id, but a published split may name files without their folders.
+    candidates = [(row["name"], row["name"].split("/", 1)[1], row["object"]) for row in rows]
+    parts = [
+        next((published[name] for name in names if name in published), None) for names in candidates
+    ]
+    unknown = sorted(set(published).difference(*candidates))
+    if unknown:
+        _log.warning(
+            "%d names in the published split fit no usable pair: %s%s",
+            len(unknown),
+            ", ".join(unknown[:5]),
+            ", ..." if len(unknown) > 5 else "",
+        )
+    objects = [row["object"] for row in rows]
+    homes: dict[str, set[str]] = {}
+    for name, part in zip(objects, parts, strict=True):
+        if part is not None:
+            homes.setdefault(name, set()).add(part)
+    leaking = sorted(name for name, where in homes.items() if len(where) > 1)
+    if leaking:
+        _log.warning(
+            "The published split has pairs of the same object in several parts, so results on "
+            "test pairs are not results on unseen objects; objects: %s",
+            ", ".join(leaking),
+        )
+    training = {name for name, where in homes.items() if "train" in where}
+    if training and fractions["val"] > 0 and "val" not in parts:
+        # An object that is tested on as well would leak into the choice of λ.
+        training = training - set(leaking) or training
+        shares = {part: fractions[part] for part in ("train", "val")}
+        total = sum(shares.values())
+        carved = _split_objects(
+            training, {part: share / total for part, share in shares.items()}, seed
+        )
+        parts = [
+            carved.get(name, part) if part == "train" else part
+            for name, part in zip(objects, parts, strict=True)
+        ]
+    return parts, {
+        "split_rule": "published",
+        "split_leakage": ", ".join(leaking),
+        "split_unknown": len(unknown),
+    }

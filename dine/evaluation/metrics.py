@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from dine.data.pairs import PairSet, read_pairs, read_variant
 from dine.errors import DataError
-from dine.evaluation.predict import read_predictions
+from dine.evaluation.predictions import read_predictions
 from dine.files import atomic_path
 from dine.results import CLEAN, condition_key
 

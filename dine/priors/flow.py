@@ -6,7 +6,6 @@ from typing import Self
 
 import numpy as np
 import torch
-import zuko
 from torch import Tensor
 
 from dine.priors.base import PRIORS, Prior, check_fields
@@ -21,6 +20,8 @@ class FlowPrior(Prior):
     """
 
     def __init__(self, points: int, transforms: int, hidden: int):
+        import zuko  # slow to import, and other priors do not need it
+
         super().__init__(points=points, transforms=transforms, hidden=hidden)
         self.register_buffer("mean", torch.zeros(3))
         self.register_buffer("scale", torch.ones(3))

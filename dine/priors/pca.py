@@ -8,8 +8,6 @@ from typing import Self
 
 import numpy as np
 import torch
-from sklearn.covariance import empirical_covariance, shrunk_covariance
-from sklearn.decomposition import PCA
 from torch import Tensor
 
 from dine.errors import DataError
@@ -56,6 +54,10 @@ class PCAPrior(Prior):
         Raises:
             DataError: fewer than two fields, a bad shape, or fields that are all equal.
         """
+        # Only fitting needs scikit-learn, which takes a while to import.
+        from sklearn.covariance import empirical_covariance, shrunk_covariance
+        from sklearn.decomposition import PCA
+
         fields = check_fields(fields)
         flat = fields.reshape(len(fields), -1)
         kept = min(components, len(flat) - 1, flat.shape[1])
