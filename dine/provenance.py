@@ -29,7 +29,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     ),
     "pairs": (*_READING, "data/prepare.py", "data/pairs.py", "data/sampling.py"),
     "corrupt": ("data/corruption.py", "data/pairs.py"),
-    "model": ("data/batch.py", "data/pairs.py", "geometry", "models"),
+    "model": ("data/batch.py", "data/pairs.py", "data/fields.py", "geometry", "models"),
     "priors": ("priors",),
     "training": ("training",),
     "evaluation": ("evaluation",),

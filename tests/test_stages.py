@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from dine import cli, config
 from dine.data.batch import make_batch
+from dine.data.fields import read_fields
 from dine.data.obtain import obtain
 from dine.data.pairs import read_pairs, read_variant
 from dine.errors import CheckpointError, ConfigError, DataError
@@ -79,7 +80,7 @@ def test_stage1_writes_weights_history_and_record(chain):
 
 
 def test_fields_are_the_models_own_on_the_training_split(chain):
-    fields = stages.read_fields(chain / "dvf.h5")
+    fields = read_fields(chain / "dvf.h5")
     train = read_pairs(chain / "pairs.h5", split="train")
     backbone, _ = stages.load_backbone(chain / "stage1" / "model.safetensors")
     again = stages.predict_fields(backbone, train, name="again", batch_size=1)

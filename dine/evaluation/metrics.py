@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from dine.data.fields import put_names
 from dine.data.pairs import PairSet, read_pairs, read_variant
 from dine.errors import DataError
 from dine.evaluation.predictions import read_predictions
@@ -92,7 +93,7 @@ def evaluate(
         file.attrs["format"] = POINT_ERRORS_FORMAT
         for key, (names, values) in errors.items():
             group = file.create_group(key)
-            group.create_dataset("pair", data=names.astype(object), dtype=h5py.string_dtype())
+            put_names(group, names)
             data = group.create_dataset("squared_distance", data=values, fletcher32=True)
             data.attrs["description"] = (
                 "(P, N) squared distance of each moved source point to the clean target"

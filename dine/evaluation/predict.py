@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from dine.data.fields import put_fields
 from dine.data.pairs import read_pairs, read_variant
 from dine.errors import DataError
 from dine.evaluation.predictions import FORMAT
@@ -51,8 +52,4 @@ def predict(
             )
             group = file.create_group(key)
             group.attrs.update(condition=condition, corruption=corruption)
-            data = group.create_dataset(
-                "displacement", data=fields, chunks=(1, *fields.shape[1:]), fletcher32=True
-            )
-            data.attrs["description"] = "(P, N, 3) predicted displacements, normalised frame"
-            group.create_dataset("pair", data=pairs.name.astype(object), dtype=h5py.string_dtype())
+            put_fields(group, pairs.name, fields)

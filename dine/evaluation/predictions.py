@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import h5py
 import numpy as np
 
-from dine.errors import DataError
+from dine.data.fields import get_names, opened
 from dine.results import CLEAN
 
 FORMAT = "dine-predictions"
@@ -37,22 +36,15 @@ def read_predictions(path: Path) -> list[Prediction]:
     Raises:
         DataError: missing, damaged, or another kind of file.
     """
-    try:
-        with h5py.File(path) as file:
-            if file.attrs.get("format") != FORMAT:
-                raise DataError(f"{path} holds no predictions; expected {FORMAT}.")
-            found = [
-                Prediction(
-                    str(group.attrs["condition"]),
-                    float(group.attrs["corruption"]),
-                    group["pair"].asstr()[:].astype(str),
-                    group["displacement"][:],
-                )
-                for group in file.values()
-            ]
-    except FileNotFoundError:
-        raise DataError(f"{path} does not exist; run `dine predict` first.") from None
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path} is damaged ({error}); delete it and run again.") from error
+    with opened(path, FORMAT) as file:
+        found = [
+            Prediction(
+                str(group.attrs["condition"]),
+                float(group.attrs["corruption"]),
+                get_names(group),
+                group["displacement"][:],
+            )
+            for group in file.values()
+        ]
     order = {CLEAN: 0, "noise": 1, "outliers": 2}
     return sorted(found, key=lambda p: (order.get(p.condition, 3), p.corruption))

@@ -423,6 +423,8 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
         "data": "Data term",
         "penalty": "Prior penalty",
         "grad_norm": "Gradient norm",
+        "val_cd": "Validation Chamfer distance",
+        "val_mce": "Validation correspondence error",
     }
     names = list(dict.fromkeys(name for frame in histories.values() for name in frame))
     columns = [

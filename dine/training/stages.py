@@ -21,6 +21,7 @@ from dine.config import (
     Training,
     check_arguments,
 )
+from dine.data.fields import FIELDS_FORMAT, put_fields, read_fields
 from dine.data.pairs import PairSet, read_pairs
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
@@ -35,7 +36,6 @@ from dine.training.progress import Progress
 log = logging.getLogger(__name__)
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
-FIELDS_FORMAT = "dine-fields"
 
 
 def new_backbone(kind: str, arguments: dict[str, Any], seed: int) -> Backbone:
@@ -240,28 +240,7 @@ def dump_fields(
     fields = predict_fields(backbone, train_pairs, name=name, batch_size=batch_size, device=device)
     with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(format=FIELDS_FORMAT, model=file_digest(model), pairs=file_digest(pairs))
-        data = file.create_dataset(
-            "displacement", data=fields, chunks=(1, *fields.shape[1:]), fletcher32=True
-        )
-        data.attrs["description"] = "(K, N, 3) predicted displacements, normalised frame"
-        file.create_dataset("name", data=train_pairs.name.astype(object), dtype=h5py.string_dtype())
-
-
-def read_fields(path: Path) -> np.ndarray:
-    """The (K, N, 3) fields of :func:`dump_fields`.
-
-    Raises:
-        DataError: missing, damaged, or another kind of file.
-    """
-    try:
-        with h5py.File(path) as file:
-            if file.attrs.get("format") != FIELDS_FORMAT:
-                raise DataError(f"{path} holds no displacement fields; expected {FIELDS_FORMAT}.")
-            return file["displacement"][:]
-    except FileNotFoundError:
-        raise DataError(f"{path} does not exist; run `dine fields` first.") from None
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path} is damaged ({error}); delete it and run again.") from error
+        put_fields(file, train_pairs.name, fields)
 
 
 def fit_prior(fields: Path, prior: PriorConfig, *, seed: int, out: Path) -> None:

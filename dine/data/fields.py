@@ -1,0 +1,62 @@
+"""Displacement fields on disk (HDF5): those of the training split, and predictions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import h5py
+import numpy as np
+
+from dine.errors import DataError
+
+FIELDS_FORMAT = "dine-fields"
+"""Fields of one model on the training split, at the top level of the file."""
+
+
+@contextmanager
+def opened(path: str | os.PathLike, expected: str) -> Iterator[h5py.File]:
+    """An HDF5 file of ours for reading; ``expected`` is its attribute ``format``.
+
+    Raises:
+        DataError: missing, damaged, of another format, or lacking what the block reads.
+    """
+    try:
+        with h5py.File(path) as file:
+            if file.attrs.get("format") != expected:
+                raise DataError(f"{path} is of another kind than {expected}.")
+            yield file
+    except FileNotFoundError:
+        raise DataError(f"{path} does not exist; run the step that makes it first.") from None
+    except (OSError, KeyError) as error:
+        raise DataError(f"{path} is damaged ({error}); delete it and run again.") from error
+
+
+def put_fields(group: h5py.Group, pair: np.ndarray, displacement: np.ndarray) -> None:
+    """Store (P, N, 3) fields in the normalised frame and the (P,) names of their pairs."""
+    data = group.create_dataset(
+        "displacement", data=displacement, chunks=(1, *displacement.shape[1:]), fletcher32=True
+    )
+    data.attrs["description"] = "(P, N, 3) predicted displacements, normalised frame"
+    put_names(group, pair)
+
+
+def put_names(group: h5py.Group, pair: np.ndarray) -> None:
+    """Store (P,) pair names."""
+    group.create_dataset("pair", data=pair.astype(object), dtype=h5py.string_dtype())
+
+
+def get_names(group: h5py.Group) -> np.ndarray:
+    """The (P,) pair names of a group."""
+    return group["pair"].asstr()[:].astype(str)
+
+
+def read_fields(path: str | os.PathLike) -> np.ndarray:
+    """The (K, N, 3) float32 training fields that a prior is fitted to.
+
+    Raises:
+        DataError: missing, damaged, or another kind of file.
+    """
+    with opened(path, FIELDS_FORMAT) as file:
+        return file["displacement"][:]
