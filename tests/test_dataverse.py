@@ -10,9 +10,15 @@ from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
+from dine.config import Dataset, Pairs
 from dine.data import dataverse
 from dine.data.dataverse import download
+from dine.data.obtain import obtain
+from dine.data.pairs import read_pairs
+from dine.data.prepare import prepare_pairs
+from dine.data.raw import synthesise
 from dine.errors import DownloadError, StorageError
+from dine.files import read_json
 
 DOI = "10.11588/DATA/TEST"
 MESH = bytes(range(256)) * 40
@@ -523,3 +529,38 @@ def test_an_archive_larger_than_the_disk(server, tmp_path, monkeypatch):
     with pytest.raises(DownloadError, match="announces 10000 bytes, and only 9999 are free"):
         fetch(server, tmp_path)
     assert names(tmp_path) == ["x.zip"]
+
+
+def test_a_published_dataset_goes_from_server_to_pairs(server, tmp_path):
+    recipe = {"levels": [0.2], "control_percents": [5], "widths": [0.3], "amplitude": 0.15}
+    synthesise(tmp_path / "held", "tissue", 3, points=64, pairs_per_level=1, seed=0, **recipe)
+    with zipfile.ZipFile(tmp_path / "Deformation_Level.zip", "w") as archive:
+        for path in sorted((tmp_path / "held" / "Deformation_Level").rglob("*.ply")):
+            archive.write(path, path.relative_to(tmp_path / "held" / "Deformation_Level"))
+    server.add("Deformation_Level.zip", (tmp_path / "Deformation_Level.zip").read_bytes())
+    for path in sorted((tmp_path / "held" / "Data").iterdir()):
+        server.add(path.name, path.read_bytes(), "Data")
+    dataset = Dataset(source={"kind": "doi", "doi": DOI, "server": server.address})
+    obtain(dataset, tmp_path / "out", seed=0)
+    assert read_json(tmp_path / "out" / "raw.json")["origin"] == "doi"
+    split = {"train": 0.4, "val": 0.3, "test": 0.3}
+    prepare_pairs(
+        tmp_path / "out" / "raw.json",
+        Pairs(points=64, convention="disc", split=split),
+        seed=0,
+        out=tmp_path / "pairs.h5",
+    )
+    pairs = read_pairs(tmp_path / "pairs.h5")
+    assert pairs.level.tolist() == [0.2] * 3
+    assert pairs.attributes["origin"] == "doi"
+    assert sorted(pairs.split) == ["test", "train", "val"]
+
+
+def test_without_a_network_the_workflow_says_what_to_do(tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        server = f"http://127.0.0.1:{free.getsockname()[1]}"
+    dataset = Dataset(source={"kind": "doi", "doi": DOI, "server": server})
+    with pytest.raises(DownloadError, match=r"kind: path"):
+        obtain(dataset, tmp_path, seed=0)
+    assert not (tmp_path / "raw.json").exists()

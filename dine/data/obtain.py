@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from pathlib import Path
 
 import pandas as pd
@@ -12,6 +13,7 @@ from dine.data.layout import Inventory, scan
 from dine.data.raw import deform_bases, synthesise
 from dine.errors import DataError
 from dine.files import atomic_path, read_json, write_json
+from dine.progress import LOG_SECONDS
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +56,7 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
         # Imported here, since only this source needs the network.
         from dine.data.dataverse import download
 
-        download(source.doi, made, source.server, source.version)
+        download(source.doi, made, source.server, source.version, progress=_Download())
         place, origin = made, DOI
     inventory = scan(place)
     if not inventory.has_pairs:
@@ -64,6 +66,19 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
         )
     report(inventory, folder)
     write_json(folder / "raw.json", {"folder": str(place), "origin": origin})
+
+
+class _Download:
+    """Logs each file when it is complete, and a long one every ten seconds."""
+
+    def __init__(self):
+        self._shown = time.monotonic()
+
+    def __call__(self, path: str, done: int, total: int | None) -> None:
+        if done == total or time.monotonic() - self._shown >= LOG_SECONDS:
+            self._shown = time.monotonic()
+            size = "?" if total is None else f"{total / 1e6:.1f}"
+            log.info("downloading %s: %.1f of %s MB", path, done / 1e6, size)
 
 
 def report(inventory: Inventory, folder: Path) -> None:

@@ -25,6 +25,7 @@ from dine.data.sampling import (
 from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
 from dine.files import digest
+from dine.progress import Progress
 
 _log = logging.getLogger(__name__)
 
@@ -36,14 +37,17 @@ def prepare_pairs(raw: Path, settings: Pairs, *, seed: int, out: Path) -> None:
         DataError: no usable pair, or too few base objects to split.
     """
     inventory, origin = obtained(raw)
-    pairs, _ = make_pairs(
-        inventory,
-        points=settings.points,
-        convention=settings.convention,
-        split=settings.split.model_dump(),
-        seed=seed,
-        origin=origin,
-    )
+    count = sum(files.condition == "deformation" for files in inventory.pairs)
+    with Progress("pairs", count, unit="pair") as bar:
+        pairs, _ = make_pairs(
+            inventory,
+            points=settings.points,
+            convention=settings.convention,
+            split=settings.split.model_dump(),
+            seed=seed,
+            origin=origin,
+            progress=lambda done, total: bar.update(),
+        )
     write_pairs(out, pairs)
 
 

@@ -26,8 +26,8 @@ from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
 from dine.geometry.graph import Graph, neighbour_graph
 from dine.models.backbones import Backbone
+from dine.progress import Progress
 from dine.training.objective import Objective
-from dine.training.progress import Progress
 from dine.training.state import Interrupted, StopRequest, load_state, one_writer, save_state
 
 log = logging.getLogger(__name__)

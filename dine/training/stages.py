@@ -28,10 +28,10 @@ from dine.files import atomic_path, digest, file_digest, read_json, write_json, 
 from dine.models.backbones import BACKBONES, Backbone
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.priors import PRIORS, load_prior
+from dine.progress import Progress
 from dine.provenance import code_digest, run_record
 from dine.training.loop import Batches, chosen_device, history_csv, train
 from dine.training.objective import DATA_TERMS, Objective
-from dine.training.progress import Progress
 
 log = logging.getLogger(__name__)
 
