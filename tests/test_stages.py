@@ -2,6 +2,10 @@
 
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 
 import h5py
 import numpy as np
@@ -132,6 +136,31 @@ def test_equal_runs_give_equal_bytes(chain, tmp_path):
     dine("stage1", "--pairs", chain / "pairs.h5", "--settings", STAGE1, "--out", tmp_path)
     first = (chain / "stage1" / "model.safetensors").read_bytes()
     assert (tmp_path / "model.safetensors").read_bytes() == first
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, number):
+    settings = json.loads(STAGE1) | {"steps": 25, "validate_every": 25, "save_seconds": 0.001}
+    command = [
+        *(sys.executable, "-m", "dine", "--threads", "1", "stage1", "--out", tmp_path / "killed"),
+        *("--pairs", chain / "pairs.h5", "--settings", json.dumps(settings)),
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    history = tmp_path / "killed" / "training" / "history.csv"
+    give_up = time.monotonic() + 60
+    while not history.exists() and time.monotonic() < give_up:
+        time.sleep(0.01)
+    process.send_signal(number)
+    error = process.communicate()[1]
+    assert process.returncode == (1 if number == signal.SIGTERM else -number)
+    assert ("run the same command again" in error) == (number == signal.SIGTERM)
+    assert not (tmp_path / "killed" / "model.safetensors").exists()
+    again = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+    assert "going on from step" in again.stderr
+    command[command.index(tmp_path / "killed")] = tmp_path / "whole"
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    whole = (tmp_path / "whole" / "model.safetensors").read_bytes()
+    assert (tmp_path / "killed" / "model.safetensors").read_bytes() == whole
 
 
 def test_predictions_and_metrics(chain, tmp_path):
