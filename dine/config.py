@@ -83,7 +83,7 @@ class Recipe(Section):
     """Shares of control points, in percent of the sampled points."""
     widths: list[Positive] = Field(default=[0.3, 0.4, 0.5], min_length=1)
     """Widths of the Gaussian radial basis function, on objects of unit radius."""
-    amplitude: Positive = 0.15
+    amplitude: Positive = 0.1
     """Standard deviation per coordinate of a control displacement at level 1."""
     pairs_per_level: Count = 1
     """Targets per object and level."""
@@ -191,8 +191,8 @@ class Training(Section):
     """Optimiser steps."""
     batch_size: Count = 1
     """Pairs per step."""
-    learning_rate: Positive = 1.0e-3
-    schedule: Literal["constant", "cosine"] = "constant"
+    learning_rate: Positive = 3.0e-4
+    schedule: Literal["constant", "cosine"] = "cosine"
     """Learning rate over the steps; `cosine` falls to a hundredth."""
     weight_decay: NonNegative = 0.01
     """AdamW's decoupled weight decay."""
@@ -243,7 +243,7 @@ class Pretraining(Training):
 
     data_term: str = "l1"
     steps: Count = 4000
-    schedule: Literal["constant", "cosine"] = "cosine"
+    learning_rate: Positive = 1.0e-3
     objects: Count = 240
     """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from dine.data.batch import make_batch
+from dine.errors import ConfigError
 from dine.models.backbones import BACKBONES
 
 DATA = Path(__file__).parent / "data"
@@ -121,3 +122,26 @@ def test_published_checkpoint_reproduces_published_predictions(shared):
         with torch.no_grad():
             displacement = backbone(batch).displacement[0].numpy()
         assert np.abs(displacement - stored[f"{mesh}/displacement"]).max() < 1e-4
+
+
+@pytest.mark.parametrize("name", SEEDS)
+def test_geometric_start_finds_small_deformations_before_any_training(name):
+    rng = np.random.default_rng(0)
+    source = rng.normal(size=(300, 3))
+    source /= np.linalg.norm(source, axis=1, keepdims=True)
+    truth = 0.05 * np.sin(2 * source[:, [1, 2, 0]])
+    batch = make_batch([source], [source + truth], dtype=torch.float64)
+    errors = {}
+    for initialisation in ("geometric", "default"):
+        torch.manual_seed(0)
+        backbone = BACKBONES.get(name)(initialisation=initialisation).double()
+        with torch.no_grad():
+            found = backbone(batch).displacement[0].numpy()
+        errors[initialisation] = np.linalg.norm(found - truth, axis=1).mean()
+    assert errors["geometric"] < 0.02
+    assert errors["default"] > 5 * errors["geometric"]
+
+
+def test_unknown_initialisation_is_refused():
+    with pytest.raises(ConfigError, match="expected geometric or default"):
+        BACKBONES.get("robust_defreg")(initialisation="magic")

@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from dine.data.batch import Batch
+from dine.errors import ConfigError
 from dine.models.belief_propagation import Candidates, propagate, read_out, select_candidates
 from dine.models.features import FeatureNetwork
 from dine.registry import Registry
@@ -52,6 +53,8 @@ class BeliefPropagationBackbone(Backbone):
         target_neighbours: k of the target's feature graph.
         smoothness: weight of squared displacement differences between neighbours.
         temperature: sharpness of the read-out.
+        initialisation: random weights as ``geometric`` (see ``FeatureNetwork.start_geometric``) or
+            ``default`` (PyTorch's own); without effect on weights that are loaded.
     """
 
     TRANSFORMER: bool
@@ -63,15 +66,24 @@ class BeliefPropagationBackbone(Backbone):
         target_neighbours: int = 30,
         smoothness: float = 10.0,
         temperature: float = 50.0,
+        initialisation: str = "geometric",
     ):
+        if initialisation not in ("geometric", "default"):
+            raise ConfigError(
+                f"The backbone's `initialisation` is {initialisation!r}; expected geometric or "
+                "default."
+            )
         super().__init__(
             candidates=candidates,
             source_neighbours=source_neighbours,
             target_neighbours=target_neighbours,
             smoothness=smoothness,
             temperature=temperature,
+            initialisation=initialisation,
         )
         network = FeatureNetwork(source_neighbours, target_neighbours, self.TRANSFORMER)
+        if initialisation == "geometric":
+            network.start_geometric()
         # The published state dicts have the feature network's entries at the top level.
         for name, module in network.named_children():
             self.add_module(name, module)

@@ -144,6 +144,7 @@ class FeatureNetwork(nn.Module):
     """
 
     CHANNELS = 64
+    DIFFERENCE_SCALE = 0.1
 
     def __init__(
         self, source_neighbours: int = 10, target_neighbours: int = 30, transformer: bool = False
@@ -162,6 +163,22 @@ class FeatureNetwork(nn.Module):
             self.transform = CrossTransformer(self.CHANNELS, heads=4, hidden=1024)
         else:
             self.register_module("transform", None)
+
+    @torch.no_grad()
+    def start_geometric(self) -> None:
+        """Make random initial features smooth functions of position.
+
+        Source and target have graphs of different size, so the differences f_j − f_i that EdgeConv
+        looks at differ in scale between the clouds; with PyTorch's own initial weights they drown
+        the positions, and points of one place get unlike features. Starting with small weights on
+        the differences, and with the identity as the T-Net's transform (as in PointNet), the same
+        place has nearly the same features in both clouds before any training.
+        """
+        nn.init.zeros_(self.input_transform.fc3.weight)
+        nn.init.zeros_(self.input_transform.fc3.bias)
+        for layer in (self.conv1, self.conv2, self.conv3):
+            weight = layer.conv[0].weight
+            weight[:, : weight.shape[1] // 2] *= self.DIFFERENCE_SCALE
 
     def forward(
         self,

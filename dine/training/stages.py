@@ -102,7 +102,8 @@ def _run(
     pairs_digests = [file_digest(path) for path in pairs_paths]
     inputs = {"pairs": pairs_digests, **inputs}
     identity = {
-        "settings": digest({**settings.model_dump(), "arguments": backbone.arguments}),
+        "settings": digest(settings.model_dump()),
+        "backbone": digest([backbone.registered_name, backbone.arguments]),
         "seed": str(seed),
         "inputs": digest(inputs),
         "code": code_digest("model", "priors", "training"),

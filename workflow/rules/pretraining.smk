@@ -3,6 +3,8 @@
 PRETRAINING = RESULTS / "pretraining"
 # Far beyond the numbers that any dataset uses, so that no object is trained on and tested on.
 FIRST_OBJECT = 1_000_000
+# Somewhat harder than the default datasets.
+AMPLITUDE = 0.15
 LEVELS = {
     "primitives": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8],
     "tissue": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7],
@@ -23,6 +25,7 @@ rule pretraining_raw:
                     "shape": wildcards.shape,
                     "objects": CONFIG.pretraining.objects // 2,
                     "levels": LEVELS[wildcards.shape],
+                    "amplitude": AMPLITUDE,
                 }
             },
             sort_keys=True,
