@@ -75,7 +75,7 @@ class Recipe(Section):
 
     shape: Literal["primitives", "tissue"] = "primitives"
     """Synthetic base objects: SynBench-like primitives or DeformedTissue-like 2.5D patches."""
-    objects: Count = 36
+    objects: Count = 34
     """Number of synthetic base objects."""
     levels: list[Positive] = Field(default=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8], min_length=1)
     """Deformation levels."""
@@ -187,7 +187,7 @@ class Training(Section):
 
     data_term: str = "chamfer"
     """Data term: `chamfer`, `l1` (needs the true displacement) or an import path."""
-    steps: Count = 480
+    steps: Count = 400
     """Optimiser steps."""
     batch_size: Count = 1
     """Pairs per step."""
@@ -198,7 +198,7 @@ class Training(Section):
     """AdamW's decoupled weight decay."""
     clip: Positive = 1.0
     """Largest norm of the gradient."""
-    validate_every: Count = 120
+    validate_every: Count = 100
     """Steps between validations on `validation_pairs`."""
     validation_pairs: Count = 16
     """Validation pairs, spread evenly over the split."""
@@ -212,7 +212,7 @@ class Stage1(Training):
 
 
 class Stage2(Training):
-    steps: Count = 240
+    steps: Count = 200
     """Optimiser steps."""
 
 
@@ -225,9 +225,9 @@ class LambdaSearch(Section):
     """Priors with a λ of their own; the others use the first one's."""
     candidates: list[Positive] = Field(default=[1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3], min_length=1)
     """Values of λ to try; λ = 0 is always tried too, for comparison."""
-    steps: Count = 120
+    steps: Count = 80
     """Stage-2 steps per candidate."""
-    validation_pairs: Count = 32
+    validation_pairs: Count = 24
     """Validation pairs on which the candidates are compared."""
 
 
