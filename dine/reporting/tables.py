@@ -489,12 +489,9 @@ def _origin_sentence(dataset: str, metrics: pd.DataFrame, with_paper: bool) -> s
     name = display_name(dataset)
     if origin is None:
         return f"This run has no results on {name}; only the published values are shown."
-    if origin == "synthetic":
-        text = f"DINE on synthetic data in the layout of {name}"
-    elif origin == "bases":
-        text = f"DINE on real base meshes with synthetic deformations in the layout of {name}"
-    else:
+    if dataset not in DATASET_NAMES or origin not in ("synthetic", "bases"):
         return f"DINE on {name} ({ORIGIN_NAMES[origin]})."
+    text = f"DINE on {ORIGIN_NAMES[origin]} in the layout of {name}"
     if with_paper:
         text += (
             f"; published values are on the real {name} data and are not comparable in absolute "
