@@ -233,6 +233,22 @@ def test_truncated_inputs_are_named(chain, tmp_path):
     assert not (tmp_path / "x.h5").exists()
 
 
+def test_missing_inputs_are_named(chain, tmp_path):
+    model, pairs = chain / "stage1" / "model.safetensors", chain / "pairs.h5"
+    none = tmp_path / "none"
+    for error, arguments in (
+        (DataError, ("stage1", "--pairs", none, "--out", tmp_path / "x")),
+        (DataError, ("fields", "--model", model, "--pairs", none, "--out", tmp_path / "x")),
+        (CheckpointError, ("fields", "--model", none, "--pairs", pairs, "--out", tmp_path / "x")),
+        (DataError, ("fit-prior", "--fields", none, "--out", tmp_path / "x")),
+        (DataError, ("pairs", "--raw", none, "--out", tmp_path / "x")),
+        (DataError, ("tables", none, "--out", tmp_path / "x")),
+    ):
+        with pytest.raises(error, match=r"none"):
+            dine(*arguments)
+    assert not (tmp_path / "x").exists()
+
+
 def test_a_prior_needs_a_weight_and_a_variant_a_prior(chain, tmp_path):
     start = ("stage2", "--pairs", chain / "pairs.h5", "--out", tmp_path)
     model = ("--model", chain / "stage1" / "model.safetensors")
