@@ -234,8 +234,6 @@ class LambdaSearch(Section):
 class Evaluation(Section):
     batch_size: Count = 4
     """Pairs per forward pass."""
-    qualitative_level: Positive = 0.6
-    """Level nearest to which the pair in the qualitative figure is chosen."""
 
 
 class Pretraining(Training):

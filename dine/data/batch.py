@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -44,9 +44,6 @@ class Batch:
             return None if value is None else value.to(device)
 
         return Batch(*(move(value) for value in vars(self).values()))
-
-    def with_target(self, target: Tensor, target_mask: Tensor | None = None) -> Batch:
-        return replace(self, target=target, target_mask=target_mask)
 
 
 def make_batch(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +95,6 @@ def _run(
     device: str,
     inputs: dict[str, Any],
     facts: dict[str, Any],
-    on_step: Callable[[int], None] | None = None,
 ) -> None:
     """Train and write ``model.safetensors``, ``history.csv`` and ``run.json`` into ``out``."""
     pairs_digests = [file_digest(path) for path in pairs_paths]
@@ -106,7 +104,7 @@ def _run(
         "backbone": digest([backbone.registered_name, backbone.arguments]),
         "seed": str(seed),
         "inputs": digest(inputs),
-        "code": code_digest("model", "priors", "training"),
+        "code": code_digest("model", "training", *(["priors"] if objective.prior else [])),
     }
     train_pairs = PairSet.concatenate([read_pairs(path, split="train") for path in pairs_paths])
     val_pairs = PairSet.concatenate([read_pairs(path, split="val") for path in pairs_paths])
@@ -122,7 +120,6 @@ def _run(
         identity=identity,
         name=name,
         device=device,
-        on_step=on_step,
     )
     # Weights carry nothing that differs between two equal runs, so they can be compared by bytes.
     save_backbone(out / "model.safetensors", backbone, name=name, seed=seed, steps=settings.steps)
@@ -157,7 +154,6 @@ def stage1(
     out: Path,
     name: str,
     device: str = "auto",
-    on_step: Callable[[int], None] | None = None,
 ) -> None:
     """Train a backbone on the data term alone."""
     backbone = starting_backbone(kind, arguments, settings.start, seed)
@@ -175,7 +171,6 @@ def stage1(
         device=device,
         inputs={"start": start},
         facts={"stage": 1, "backbone": kind, "arguments": backbone.arguments},
-        on_step=on_step,
     )
 
 
@@ -279,7 +274,6 @@ def stage2(
     out: Path,
     name: str,
     device: str = "auto",
-    on_step: Callable[[int], None] | None = None,
 ) -> None:
     """Refine a Stage-1 model with λ times a frozen prior; ``lambda0`` is the control without."""
     if (prior is None) != (variant == CONTROL):
@@ -303,7 +297,6 @@ def stage2(
             "lambda": weight,
         },
         facts={"stage": 2, "variant": variant, "lambda": weight, "backbone": facts["backbone"]},
-        on_step=on_step,
     )
 
 

@@ -12,7 +12,9 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parents[2]
-TINY = ROOT / "config" / "tiny.yaml"
+TINY = "config/tiny.yaml"
+# A space, since people have folders with spaces.
+RESULTS = "results/tiny run"
 
 
 def snakemake(folder, *arguments, check=True):
@@ -33,6 +35,8 @@ def copy_workflow(folder):
         shutil.copy(ROOT / name, folder)
     for name in ("workflow", "config", "profiles"):
         shutil.copytree(ROOT / name, folder / name)
+    tiny = folder / TINY
+    tiny.write_text(tiny.read_text().replace("results: results/tiny", f"results: {RESULTS}"))
     return folder
 
 
@@ -60,7 +64,7 @@ def changed(folder, changes):
 
 
 def test_everything_is_there(finished):
-    results = finished / "results" / "tiny"
+    results = finished / RESULTS
     tables = {path.stem for path in (results / "tables").glob("*.csv")}
     assert {"table1", "table2", "table3", "gains_synbench", "correspondence_synbench"} <= tables
     for table in tables:
@@ -75,7 +79,7 @@ def test_everything_is_there(finished):
 
 
 def test_tables_follow_from_the_metrics(finished):
-    results = finished / "results" / "tiny"
+    results = finished / RESULTS
     table = pd.read_csv(results / "tables" / "table2.csv")
     metrics = pd.read_csv(results / "synbench" / "deftransnet" / "stage2" / "flow" / "metrics.csv")
     row = table[(table["backbone"] == "deftransnet") & (table["method"] == "flow")]
@@ -85,7 +89,7 @@ def test_tables_follow_from_the_metrics(finished):
 
 
 def test_every_run_has_its_control(finished):
-    results = finished / "results" / "tiny"
+    results = finished / RESULTS
     for dataset in ("synbench", "deformedtissue"):
         for backbone in ("robust_defreg", "deftransnet"):
             folder = results / dataset / backbone / "stage2"
@@ -156,7 +160,7 @@ def test_a_change_reruns_what_depends_on_it(finished, change):
 def test_one_ablation_uses_what_is_cached(finished):
     assert planned(finished, "prior_flow", "--configfile", TINY) == {"prior_flow": 1}
     snakemake(finished, "prior_flow", "--configfile", TINY)
-    gains = pd.read_csv(finished / "results" / "tiny" / "ablation" / "flow" / "gains_synbench.csv")
+    gains = pd.read_csv(finished / RESULTS / "ablation" / "flow" / "gains_synbench.csv")
     assert set(gains["method"]) == {"flow"}
 
 
@@ -171,7 +175,7 @@ def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
 
 
 def test_a_finished_model_is_restored_bit_for_bit(finished):
-    model = finished / "results/tiny/synbench/robust_defreg/stage1/model.safetensors"
+    model = finished / RESULTS / "synbench/robust_defreg/stage1/model.safetensors"
     before = model.read_bytes()
     state = model.parent / "training" / "state.pt"
     assert state.is_file()

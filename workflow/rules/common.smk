@@ -1,6 +1,7 @@
 # Shared by all rules. The checked configuration, paths, names and parameters.
 
 import json
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -49,10 +50,14 @@ wildcard_constraints:
     shape="primitives|tissue",
 
 
-def section(model, **changes):
+def section(model):
     """One narrow section of the configuration as text, for a rule's params and command line."""
-    values = model.model_dump(mode="json", exclude_none=True) | changes
-    return json.dumps(values, sort_keys=True)
+    return json.dumps(model.model_dump(mode="json", exclude_none=True), sort_keys=True)
+
+
+def options(flag, *columns):
+    """A repeated command-line option, quoted for the shell: one for each row of the columns."""
+    return " ".join(shlex.join([flag, *map(str, row)]) for row in zip(*columns))
 
 
 def variant_files(wildcards):
@@ -60,10 +65,6 @@ def variant_files(wildcards):
         FILES.variant(wildcards.dataset, *condition)
         for condition in conditions(CONFIG, wildcards.dataset)
     ]
-
-
-def method_of(run):
-    return run.removeprefix("stage2/")
 
 
 def raw_settings(wildcards):
@@ -114,4 +115,4 @@ def stage2_outputs(variant):
 
 
 def variant_options(wildcards, input):
-    return " ".join(f"--variant {path}" for path in input.variants)
+    return options("--variant", input.variants)

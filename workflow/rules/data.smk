@@ -18,8 +18,8 @@ rule raw:
         seed=CONFIG.seed,
         code=code_digest("raw"),
     shell:
-        "dine --log {log} raw --settings {params.settings:q} --seed {params.seed}"
-        " --out $(dirname {output.raw:q})"
+        "dine --log {log:q} raw --settings {params.settings:q} --seed {params.seed}"
+        " --out \"$(dirname {output.raw:q})\""
 
 
 rule pairs:
@@ -38,7 +38,7 @@ rule pairs:
         seed=CONFIG.seed,
         code=code_digest("pairs"),
     shell:
-        "dine --log {log} pairs --raw {input:q} --settings {params.settings:q}"
+        "dine --log {log:q} pairs --raw {input:q} --settings {params.settings:q}"
         " --seed {params.seed} --out {output:q}"
 
 
@@ -57,7 +57,7 @@ rule agreement:
         seed=CONFIG.seed,
         code=code_digest("pairs"),
     shell:
-        "dine --log {log} agreement --pairs {input:q} --seed {params.seed} --out {output:q}"
+        "dine --log {log:q} agreement --pairs {input:q} --seed {params.seed} --out {output:q}"
 
 
 rule corrupt:
@@ -75,5 +75,5 @@ rule corrupt:
         seed=CONFIG.seed,
         code=code_digest("corrupt"),
     shell:
-        "dine --log {log} corrupt --pairs {input:q} --condition {wildcards.condition}"
+        "dine --log {log:q} corrupt --pairs {input:q} --condition {wildcards.condition}"
         " --level {wildcards.corruption} --seed {params.seed} --out {output:q}"

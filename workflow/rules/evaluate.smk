@@ -23,7 +23,7 @@ rule predict:
         device=CONFIG.device,
         code=code_digest("model"),
     shell:
-        "dine --log {log} --threads {threads} predict --model {input.model:q}"
+        "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
         " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
         " --device {params.device}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.run}' --out {output:q}"
@@ -45,10 +45,10 @@ rule evaluate:
         "../envs/dine.yaml"
     params:
         variants=variant_options,
-        method=lambda wildcards: method_of(wildcards.run),
+        method=lambda wildcards: wildcards.run.removeprefix("stage2/"),
         code=code_digest("evaluation"),
     shell:
-        "dine --log {log} evaluate --predictions {input.predictions:q} --pairs {input.pairs:q}"
+        "dine --log {log:q} evaluate --predictions {input.predictions:q} --pairs {input.pairs:q}"
         " {params.variants} --dataset {wildcards.dataset} --backbone {wildcards.backbone}"
         " --method {params.method} --point-errors {output.point_errors:q}"
         " --out {output.metrics:q}"

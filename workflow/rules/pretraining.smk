@@ -34,8 +34,8 @@ rule pretraining_raw:
         seed=CONFIG.seed,
         code=code_digest("raw"),
     shell:
-        "dine --log {log} raw --settings {params.settings:q} --first-object {params.first}"
-        " --seed {params.seed} --out $(dirname {output:q})"
+        "dine --log {log:q} raw --settings {params.settings:q} --first-object {params.first}"
+        " --seed {params.seed} --out \"$(dirname {output:q})\""
 
 
 rule pretraining_pairs:
@@ -58,7 +58,7 @@ rule pretraining_pairs:
         seed=CONFIG.seed,
         code=code_digest("pairs"),
     shell:
-        "dine --log {log} pairs --raw {input:q} --settings {params.settings:q}"
+        "dine --log {log:q} pairs --raw {input:q} --settings {params.settings:q}"
         " --seed {params.seed} --out {output:q}"
 
 
@@ -79,16 +79,16 @@ rule pretrain:
     resources:
         gpu=GPUS,
     params:
-        pairs=lambda wildcards, input: " ".join(f"--pairs {path}" for path in input),
+        pairs=lambda wildcards, input: options("--pairs", input),
         backbone=backbone_settings,
         settings=section(CONFIG.pretraining),
         seed=CONFIG.seed,
         device=CONFIG.device,
         code=code_digest("model", "training"),
     shell:
-        "dine --log {log} --threads {threads} pretrain {params.pairs}"
+        "dine --log {log:q} --threads {threads} pretrain {params.pairs}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
-        " --device {params.device} --out $(dirname {output.model:q})"
+        " --device {params.device} --out \"$(dirname {output.model:q})\""
 
 
 rule pretrained:

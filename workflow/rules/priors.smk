@@ -19,7 +19,7 @@ rule fit_prior:
         seed=CONFIG.seed,
         code=code_digest("priors"),
     shell:
-        "dine --log {log} --threads {threads} fit-prior --fields {input:q}"
+        "dine --log {log:q} --threads {threads} fit-prior --fields {input:q}"
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
 
 
@@ -47,17 +47,14 @@ rule search_lambda:
     resources:
         gpu=GPUS,
     params:
-        priors=" ".join(
-            f"--prior {prior} {FILES.prior(SEARCH.dataset, SEARCH.backbone, prior)}"
-            for prior in SEARCH.priors
-        ),
+        priors=lambda wildcards, input: options("--prior", SEARCH.priors, input.priors),
         stage2=section(CONFIG.stage2),
         settings=section(SEARCH),
         seed=CONFIG.seed,
         device=CONFIG.device,
         code=code_digest("model", "priors", "training"),
     shell:
-        "dine --log {log} --threads {threads} search-lambda --pairs {input.pairs:q}"
+        "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
         " --model {input.model:q} {params.priors} --stage2 {params.stage2:q}"
         " --settings {params.settings:q} --seed {params.seed} --device {params.device}"
         " --out {output:q}"

@@ -31,7 +31,7 @@ rule tables:
     params:
         code=code_digest("reporting"),
     shell:
-        "dine --log {log} tables {input:q} --out $(dirname {output.all:q})"
+        "dine --log {log:q} tables {input:q} --out \"$(dirname {output.all:q})\""
 
 
 rule figures:
@@ -66,8 +66,8 @@ rule figures:
         settings=section(CONFIG),
         code=code_digest("reporting"),
     shell:
-        "dine --log {log} figures --results {params.results:q} --settings {params.settings:q}"
-        " --out $(dirname {output.figures[0]:q})"
+        "dine --log {log:q} figures --results {params.results:q} --settings {params.settings:q}"
+        " --out \"$(dirname {output.figures[0]:q})\""
 
 
 rule resolved_config:
@@ -80,7 +80,7 @@ rule resolved_config:
     params:
         config=section(CONFIG),
     shell:
-        "dine --log {log} config write {params.config:q} --out {output:q}"
+        "dine --log {log:q} config write {params.config:q} --out {output:q}"
 
 
 rule html:
@@ -111,7 +111,7 @@ rule html:
         settings=section(CONFIG),
         code=code_digest("reporting"),
     shell:
-        "dine --log {log} report --results {params.results:q} --settings {params.settings:q}"
+        "dine --log {log:q} report --results {params.results:q} --settings {params.settings:q}"
         " --out {output:q}"
 
 
@@ -140,7 +140,7 @@ for PRIOR in CONFIG.priors:
         params:
             code=code_digest("reporting"),
         shell:
-            "dine --log {log} tables {input:q} --out $(dirname {output:q})"
+            "dine --log {log:q} tables {input:q} --out \"$(dirname {output:q})\""
 
 
 # Handles for parts of the work.

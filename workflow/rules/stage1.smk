@@ -25,10 +25,10 @@ rule stage1:
         device=CONFIG.device,
         code=code_digest("model", "training"),
     shell:
-        "dine --log {log} --threads {threads} stage1 --pairs {input.pairs:q}"
+        "dine --log {log:q} --threads {threads} stage1 --pairs {input.pairs:q}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
         " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/stage1'"
-        " --out $(dirname {output.model:q})"
+        " --out \"$(dirname {output.model:q})\""
 
 
 rule fields:
@@ -52,6 +52,6 @@ rule fields:
         device=CONFIG.device,
         code=code_digest("model"),
     shell:
-        "dine --log {log} --threads {threads} fields --model {input.model:q}"
+        "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
         " --pairs {input.pairs:q} --batch-size {params.batch} --device {params.device}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/fields' --out {output:q}"

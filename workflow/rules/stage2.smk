@@ -22,10 +22,10 @@ rule stage2_control:
         device=CONFIG.device,
         code=code_digest("model", "training"),
     shell:
-        "dine --log {log} --threads {threads} stage2 --pairs {input.pairs:q}"
+        "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --settings {params.settings:q} --seed {params.seed}"
         " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/lambda0'"
-        " --out $(dirname {output.model:q})"
+        " --out \"$(dirname {output.model:q})\""
 
 
 rule stage2_prior:
@@ -51,9 +51,9 @@ rule stage2_prior:
         device=CONFIG.device,
         code=code_digest("model", "priors", "training"),
     shell:
-        "dine --log {log} --threads {threads} stage2 --pairs {input.pairs:q}"
+        "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --variant {wildcards.prior} --prior {input.prior:q}"
         " --lambda {input.weight:q} --settings {params.settings:q} --seed {params.seed}"
         " --device {params.device}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior}'"
-        " --out $(dirname {output.model:q})"
+        " --out \"$(dirname {output.model:q})\""
