@@ -35,7 +35,7 @@ rule pretraining_raw:
         code=code_digest("raw"),
     shell:
         "dine --log {log:q} raw --settings {params.settings:q} --first-object {params.first}"
-        " --seed {params.seed} --out \"$(dirname {output:q})\""
+        ' --seed {params.seed} --out "$(dirname {output:q})"'
 
 
 rule pretraining_pairs:
@@ -88,7 +88,7 @@ rule pretrain:
     shell:
         "dine --log {log:q} --threads {threads} pretrain {params.pairs}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
-        " --device {params.device} --out \"$(dirname {output.model:q})\""
+        ' --device {params.device} --out "$(dirname {output.model:q})"'
 
 
 rule pretrained:

@@ -28,7 +28,7 @@ rule stage1:
         "dine --log {log:q} --threads {threads} stage1 --pairs {input.pairs:q}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
         " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/stage1'"
-        " --out \"$(dirname {output.model:q})\""
+        ' --out "$(dirname {output.model:q})"'
 
 
 rule fields:

@@ -25,7 +25,7 @@ rule stage2_control:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --settings {params.settings:q} --seed {params.seed}"
         " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/lambda0'"
-        " --out \"$(dirname {output.model:q})\""
+        ' --out "$(dirname {output.model:q})"'
 
 
 rule stage2_prior:
@@ -56,4 +56,4 @@ rule stage2_prior:
         " --lambda {input.weight:q} --settings {params.settings:q} --seed {params.seed}"
         " --device {params.device}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior}'"
-        " --out \"$(dirname {output.model:q})\""
+        ' --out "$(dirname {output.model:q})"'
