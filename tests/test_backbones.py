@@ -9,7 +9,7 @@ import torch
 
 from dine.data.batch import make_batch
 from dine.errors import ConfigError
-from dine.models import kernels
+from dine.models import compiled
 from dine.models.backbones import BACKBONES
 
 DATA = Path(__file__).parent / "data"
@@ -50,7 +50,7 @@ def golden():
 @pytest.mark.parametrize("name", SEEDS)
 def test_golden_numbers(golden, name, size, path, monkeypatch):
     if path == "eager":  # what runs on a GPU
-        monkeypatch.setattr(kernels, "supported", lambda *tensors: False)
+        monkeypatch.setattr(compiled, "supported", lambda *tensors: False)
     expected = {
         key.removeprefix(f"{name}/{size}/"): value
         for key, value in golden.items()

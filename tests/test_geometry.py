@@ -6,8 +6,9 @@ import torch
 
 from dine.data.batch import make_batch
 from dine.errors import DataError
-from dine.geometry.chamfer import chamfer_distance, nearest_squared, squared_distances
+from dine.geometry.chamfer import chamfer_distance, nearest_squared
 from dine.geometry.graph import batch_graphs, neighbour_graph
+from dine.geometry.neighbours import squared_distances
 
 
 def cloud(count, seed=0):

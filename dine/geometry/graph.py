@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -30,6 +31,12 @@ class Graph:
         return Graph(
             self.tail.to(device), self.head.to(device), self.reverse.to(device), self.nodes
         )
+
+    @cached_property
+    def start(self) -> Tensor:
+        """(nodes + 1,) int64: the edges that reach node i are start[i]…start[i + 1]."""
+        nodes = torch.arange(self.nodes + 1, device=self.head.device)
+        return torch.searchsorted(self.head, nodes)
 
 
 def neighbour_graph(points: np.ndarray, k: int) -> Graph:

@@ -7,7 +7,7 @@ neighbour graph make neighbours agree. One update sends, along each directed edg
     h_{ij}(a)  = u_i(a) + Σ_{k→i} m_{k→i}(a) − m_{j→i}(a),
 
 with candidate displacements c, unary costs u and smoothness s. The minimisation over K×K candidate
-pairs per edge is the hot path of the whole system; see :func:`send_messages`.
+pairs per edge is the hot path of the whole system; on the CPU it is compiled.
 """
 
 from __future__ import annotations
@@ -17,9 +17,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dine.geometry.chamfer import gather_points, squared_distances
 from dine.geometry.graph import Graph
-from dine.models import kernels
+from dine.geometry.neighbours import gather_points, squared_distances
+from dine.models import compiled
+from dine.models.compiled.messages import BeliefPropagation
+from dine.models.compiled.selection import CandidateCost, nearest_candidates
 
 INVALID_COST = 1e6
 """Unary cost of a padded candidate: large enough never to win, small enough to stay finite."""
@@ -52,22 +54,37 @@ def select_candidates(
 
     Targets with fewer points than ``count`` use all of theirs; the surplus costs INVALID_COST.
     """
-    distances = squared_distances(source_features, target_features)
-    with torch.no_grad():
-        ranked = distances.detach()
-        if target_mask is not None:
-            ranked = ranked.masked_fill(~target_mask.unsqueeze(1), torch.inf)
-        count = min(count, target.shape[1])
-        index = ranked.topk(count, dim=2, largest=False, sorted=False).indices
-        chosen = gather_points(target, index.flatten(1)).view(*index.shape, 3)
-        displacement = chosen - source.unsqueeze(2)
-    cost = distances.gather(2, index) / source_features.shape[-1]
+    count = min(count, target.shape[1])
+    clouds = (source, target, source_features, target_features)
+    if compiled.supported(*clouds):
+        index, displacement, cost = nearest_candidates(*clouds, count, target_mask)
+        cost = CandidateCost.apply(source_features, target_features, index, cost)
+    else:
+        index, displacement, cost = select_candidates_eager(*clouds, count, target_mask)
     if target_mask is not None:
-        valid = target_mask.unsqueeze(1).expand(-1, source.shape[1], -1).gather(2, index)
+        valid = cost.detach().isfinite()
         cost = cost.masked_fill(~valid, INVALID_COST)
         # Candidates beyond a small target repeat a valid displacement, so that sums stay tame.
         displacement = displacement.masked_fill(~valid.unsqueeze(-1), 0)
     return Candidates(index, displacement, cost)
+
+
+def select_candidates_eager(
+    source: Tensor,
+    target: Tensor,
+    source_features: Tensor,
+    target_features: Tensor,
+    count: int,
+    target_mask: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Index, displacement and cost (infinite at invalid targets) in plain PyTorch."""
+    distances = squared_distances(source_features, target_features)
+    if target_mask is not None:
+        distances = distances.masked_fill(~target_mask.unsqueeze(1), torch.inf)
+    index = distances.detach().topk(count, dim=2, largest=False, sorted=False).indices
+    chosen = gather_points(target, index.flatten(1)).view(*index.shape, 3)
+    cost = distances.gather(2, index) / source_features.shape[-1]
+    return index, (chosen - source.unsqueeze(2)).detach(), cost
 
 
 class _MinSum(torch.autograd.Function):
@@ -84,8 +101,6 @@ class _MinSum(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor):
         (argmin,) = ctx.saved_tensors
-        if kernels.supported(grad):
-            return kernels.scatter_rows(grad, argmin), None, None, None
         scattered = torch.zeros_like(grad).scatter_add_(1, argmin.to(torch.int64), grad)
         return scattered, None, None, None
 
@@ -93,7 +108,10 @@ class _MinSum(torch.autograd.Function):
 def send_messages(
     h: Tensor, displacement: Tensor, graph: Graph, smoothness: float, with_argmin: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """One message update, without gradient.
+    """One message update in plain PyTorch, without gradient.
+
+    ‖c − c'‖² = ‖c‖² − 2c·c' + ‖c'‖² makes the update a batched rank-3 product followed by a
+    minimum; chunks of edges bound the memory of the K×K matrices.
 
     Args:
         h: (E, K) cost of the tail's candidates, per edge.
@@ -103,26 +121,12 @@ def send_messages(
         with_argmin: also return which candidate won.
 
     Returns:
-        (E, K) messages to the head's candidates, and the (E, K) winners, which may be None where
-        they were not asked for.
-    """
-    if kernels.supported(h) and h.shape[1] <= kernels.MAX_CANDIDATES:
-        return kernels.send_messages(h, displacement, graph.tail, graph.head, smoothness)
-    return send_messages_eager(h, displacement, graph, smoothness, with_argmin)
-
-
-def send_messages_eager(
-    h: Tensor, displacement: Tensor, graph: Graph, smoothness: float, with_argmin: bool
-) -> tuple[Tensor, Tensor | None]:
-    """:func:`send_messages` in plain PyTorch, on any device.
-
-    ‖c − c'‖² = ‖c‖² − 2c·c' + ‖c'‖² makes the update a batched rank-3 product followed by a
-    minimum; chunks of edges keep the K×K matrices in cache.
+        (E, K) messages to the head's candidates, and the (E, K) winners, or None.
     """
     edges, count = h.shape
     squares = displacement.square().sum(-1) * smoothness
     messages = torch.empty_like(h)
-    argmin = torch.empty(h.shape, dtype=torch.int16, device=h.device) if with_argmin else None
+    argmin = torch.empty(h.shape, dtype=torch.int32, device=h.device) if with_argmin else None
     chunk = 64 if h.device.type == "cpu" else max(1, 2**28 // (count * count))
     for start in range(0, edges, chunk):
         part = slice(start, start + chunk)
@@ -133,7 +137,7 @@ def send_messages_eager(
         )
         if with_argmin:
             messages[part], best = table.min(dim=2)
-            argmin[part] = best.to(torch.int16)
+            argmin[part] = best.to(torch.int32)
         else:
             messages[part] = table.amin(dim=2)
     return messages.add_(squares[graph.head]), argmin
@@ -146,9 +150,17 @@ def propagate(
 
     The published loop makes three updates but reads the sum before the last, so two matter.
     """
-    shape = candidates.cost.shape
     cost = candidates.cost.flatten(0, 1)
     displacement = candidates.displacement.flatten(0, 1).contiguous()
+    propagated = BeliefPropagation.apply if compiled.supported(cost) else propagate_eager
+    belief = propagated(cost, displacement, graph, smoothness, updates)
+    return belief.view(candidates.cost.shape)
+
+
+def propagate_eager(
+    cost: Tensor, displacement: Tensor, graph: Graph, smoothness: float, updates: int
+) -> Tensor:
+    """:func:`propagate` in plain PyTorch, on any device; nodes counted over the batch, (V, K)."""
     belief = cost
     messages = None
     for _ in range(updates):
@@ -157,7 +169,7 @@ def propagate(
             h = h - messages[graph.reverse]
         messages = _MinSum.apply(h, displacement, graph, smoothness)
         belief = cost.index_add(0, graph.head, messages)
-    return belief.view(shape)
+    return belief
 
 
 def read_out(candidates: Candidates, belief: Tensor, temperature: float = 50.0) -> Tensor:

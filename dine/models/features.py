@@ -10,10 +10,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from dine.geometry.chamfer import gather_points, squared_distances
-from dine.models import kernels
+from dine.geometry.neighbours import Neighbours, gather_points, nearest_neighbours
+from dine.models import compiled
+from dine.models.compiled.convolution import EdgeConvolution, Edges, LinearMaximum
+from dine.models.compiled.rows import NormLeakyReLU
 
 NORM_EPS = 1e-5
+
+GROUP = 64
+"""Points of which the T-Net takes a maximum at once, before that over all."""
 
 
 def instance_norm(x: Tensor, mask: Tensor | None = None, slope: float = 1.0) -> Tensor:
@@ -21,8 +26,8 @@ def instance_norm(x: Tensor, mask: Tensor | None = None, slope: float = 1.0) -> 
 
     The variance is the biased one; a slope of 1 is the norm alone.
     """
-    if kernels.supported(x):
-        return kernels.NormLeakyReLU.apply(x, slope, mask, NORM_EPS)
+    if compiled.supported(x):
+        return NormLeakyReLU.apply(x, slope, mask, NORM_EPS)
     return instance_norm_eager(x, mask, slope)
 
 
@@ -32,18 +37,27 @@ def instance_norm_eager(x: Tensor, mask: Tensor | None = None, slope: float = 1.
     return F.leaky_relu((x - mean) * scale, slope)
 
 
+def linear_maximum(x: Tensor, weight: Tensor, group: int, mask: Tensor | None = None) -> Tensor:
+    """Instance norm of the rows x Wᵀ of (B, L, C), then the maximum over each ``group`` of rows.
+
+    Returns (B, ⌈L / group⌉, C'); a group without valid rows gives zeros.
+    """
+    if compiled.supported(x, weight):
+        return LinearMaximum.apply(x, weight, group, mask, NORM_EPS)
+    x = F.linear(x, weight)
+    surplus = -x.shape[1] % group
+    if surplus:
+        if mask is None:
+            mask = x.new_ones(x.shape[:2], dtype=torch.bool)
+        x, mask = F.pad(x, (0, 0, 0, surplus)), F.pad(mask, (0, surplus))
+    return normalised_maximum(x.unflatten(1, (-1, group)), mask)
+
+
 def normalised_maximum(x: Tensor, mask: Tensor | None = None) -> Tensor:
     """Instance norm over all rows of (B, G, k, C), then the maximum over k: (B, G, C).
 
     The mask is (B, G·k); a group without valid rows gives zeros.
     """
-    if kernels.supported(x):
-        return kernels.NormMax.apply(x, mask, NORM_EPS)
-    return normalised_maximum_eager(x, mask)
-
-
-def normalised_maximum_eager(x: Tensor, mask: Tensor | None = None) -> Tensor:
-    """:func:`normalised_maximum` in plain PyTorch, on any device."""
     mean, scale = _statistics(x.flatten(1, 2), mask)
     if mask is None:
         return (x.amax(dim=2) - mean) * scale
@@ -87,9 +101,10 @@ class TNet(nn.Module):
         """(B, N, 3) to (B, 3, 3)."""
         x = F.relu(instance_norm(pointwise(x, self.conv1), mask))
         x = F.relu(instance_norm(pointwise(x, self.conv2), mask))
-        # ReLU keeps the order of values, so the maximum over points can be taken before it.
-        x = normalised_maximum(pointwise(x, self.conv3).unsqueeze(1), mask)
-        x = F.relu(x.squeeze(1))
+        # The norm takes the bias away again, and ReLU keeps the order of values.
+        weight = self.conv3.weight.flatten(1)
+        x = F.relu(linear_maximum(x, weight, GROUP, mask).max(dim=1).values)
+        x = x + 0 * self.conv3.bias  # an exact zero gradient
         # InstanceNorm1d on a (batch, channels) tensor normalises each row over its channels.
         x = F.relu(F.layer_norm(self.fc1(x), (512,), eps=NORM_EPS))
         x = F.relu(F.layer_norm(self.fc2(x), (256,), eps=NORM_EPS))
@@ -108,31 +123,35 @@ class EdgeConv(nn.Module):
             layers += [nn.Conv2d(inputs, width, 1, bias=False), nn.Identity(), nn.Identity()]
         self.conv = nn.Sequential(*layers)
 
-    def forward(self, x: Tensor, neighbours: Tensor, mask: Tensor | None = None) -> Tensor:
-        """(B, N, C) features and (B, N, k) neighbour indices to (B, N, width)."""
-        batch, points, channels = x.shape
-        k = neighbours.shape[-1]
-        edge_mask = None if mask is None else mask.repeat_interleave(k, dim=1)
+    def forward(self, x: Tensor, neighbours: Neighbours, edges: Edges | None = None) -> Tensor:
+        """(B, N, C) features and N neighbourhoods to (B, N, width).
+
+        ``edges`` holds the same neighbours in the form of the compiled kernels, where they run.
+        """
+        channels = x.shape[2]
         # W·[f_j − f_i, f_i] = W₁f_j + (W₂ − W₁)f_i: two products on points instead of one on edges.
         weight = self.conv[0].weight.flatten(1)
         near, own = weight[:, :channels], weight[:, channels:]
-        edges = gather_points(F.linear(x, near), neighbours.flatten(1)).view(batch, points, k, -1)
-        edges = (edges + F.linear(x, own - near).unsqueeze(2)).flatten(1, 2)
-        edges = instance_norm(edges, edge_mask, self.SLOPE)
-        edges = instance_norm(pointwise(edges, self.conv[3]), edge_mask, self.SLOPE)
-        edges = pointwise(edges, self.conv[6]).view(batch, points, k, -1)
+        near, own = F.linear(x, near), F.linear(x, own - near)
+        middle, last = (self.conv[i].weight.flatten(1) for i in (3, 6))
+        if edges is not None:
+            x = EdgeConvolution.apply(near, own, middle, last, edges, self.SLOPE, NORM_EPS)
+        else:
+            x = edge_convolution(near, own, middle, last, neighbours, self.SLOPE)
         # LeakyReLU, too, commutes with the maximum.
-        return F.leaky_relu(normalised_maximum(edges, edge_mask), self.SLOPE)
+        return F.leaky_relu(x, self.SLOPE)
 
 
-def nearest_neighbours(x: Tensor, k: int, mask: Tensor | None = None) -> Tensor:
-    """Indices (B, N, k) of the k nearest points of each point of (B, N, 3), itself included."""
-    with torch.no_grad():
-        distances = squared_distances(x, x)
-        if mask is not None:
-            # A padded point's own row is meaningless but must stay in range.
-            distances = distances.masked_fill(~mask.unsqueeze(1), torch.inf)
-        return distances.topk(k, dim=2, largest=False, sorted=False).indices
+def edge_convolution(
+    near: Tensor, own: Tensor, middle: Tensor, last: Tensor, neighbours: Neighbours, slope: float
+) -> Tensor:
+    """:class:`EdgeConvolution` in plain PyTorch, on any device."""
+    index, mask = neighbours.index, neighbours.mask
+    mask = None if mask is None else mask.flatten(1)
+    edges = gather_points(near, index.flatten(1)).unflatten(1, index.shape[1:])
+    edges = instance_norm((edges + own.unsqueeze(2)).flatten(1, 2), mask, slope)
+    edges = instance_norm(F.linear(edges, middle), mask, slope)
+    return normalised_maximum(F.linear(edges, last).unflatten(1, index.shape[1:]), mask)
 
 
 class FeatureNetwork(nn.Module):
@@ -196,24 +215,11 @@ class FeatureNetwork(nn.Module):
 
     def _local(self, x: Tensor, k: int, mask: Tensor | None) -> Tensor:
         x = x @ self.input_transform(x, mask)
-        if mask is None:
-            neighbours = nearest_neighbours(x, min(k, x.shape[1]))
-            return self._edges(x, neighbours, None)
-        # Smaller clouds than k would reach into the padding, so such members run on their own.
-        sizes = mask.sum(1)
-        if int(sizes.min()) >= k:
-            return self._edges(x, nearest_neighbours(x, k, mask), mask)
-        rows = []
-        for row, size in zip(x, sizes.tolist(), strict=True):
-            own = row[None, :size]
-            features = self._edges(own, nearest_neighbours(own, min(k, size)), None)
-            rows.append(F.pad(features[0], (0, 0, 0, x.shape[1] - size)))
-        return torch.stack(rows)
-
-    def _edges(self, x: Tensor, neighbours: Tensor, mask: Tensor | None) -> Tensor:
-        x = self.conv1(x, neighbours, mask)
-        x = self.conv2(x, neighbours, mask)
-        return self.conv3(x, neighbours, mask)
+        neighbours = nearest_neighbours(x, x, k, mask, mask)
+        edges = Edges(neighbours) if compiled.supported(x) else None
+        for layer in (self.conv1, self.conv2, self.conv3):
+            x = layer(x, neighbours, edges)
+        return x
 
     def _head(self, x: Tensor, mask: Tensor | None) -> Tensor:
         return pointwise(instance_norm(pointwise(x, self.conv4[0]), mask), self.conv4[2])
@@ -230,8 +236,10 @@ class UnbiasedNorm(nn.Module):
         self.b_2 = nn.Parameter(torch.zeros(channels))
 
     def forward(self, x: Tensor) -> Tensor:
-        variance, mean = torch.var_mean(x, dim=-1, keepdim=True, correction=1)
-        return self.a_2 * (x - mean) / (variance.sqrt() + self.EPS) + self.b_2
+        # Much faster than torch.var_mean over so few channels.
+        x = x - x.mean(dim=-1, keepdim=True)
+        std = (x.square().sum(dim=-1, keepdim=True) / (x.shape[-1] - 1)).sqrt()
+        return x * (self.a_2 / (std + self.EPS)) + self.b_2
 
 
 class Attention(nn.Module):

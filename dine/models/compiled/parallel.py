@@ -1,0 +1,42 @@
+"""How kernels are compiled and shared out among threads."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+# Not the full fast-math set: infinities must keep their meaning, and sums are split by hand.
+_FAST = {"contract", "nsz", "nnan", "arcp", "afn"}
+jit = numba.njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+
+
+def supported(*tensors: Tensor) -> bool:
+    """Whether the compiled kernels take these tensors: float32 or float64 on the CPU."""
+    return all(
+        t.device.type == "cpu" and t.dtype in (torch.float32, torch.float64) for t in tensors
+    )
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
+
+
+def run(kernel, first: int, last: int, *arguments) -> None:
+    """Call ``kernel(*arguments, first, last)``, split over torch's number of threads."""
+    threads = min(torch.get_num_threads(), last - first)
+    if threads <= 1:
+        kernel(*arguments, first, last)
+        return
+    bounds = np.linspace(first, last, threads + 1).astype(int).tolist()
+    parts = list(pairwise(bounds))
+    others = [_pool(threads - 1).submit(kernel, *arguments, *part) for part in parts[1:]]
+    kernel(*arguments, *parts[0])
+    for other in others:
+        other.result()
