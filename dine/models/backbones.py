@@ -32,9 +32,15 @@ class Registration:
 
 
 class Backbone(nn.Module):
-    """Base of all backbones. ``arguments`` are stored with the weights and rebuild the module."""
+    """Base of all backbones. ``arguments`` are stored with the weights and rebuild the module.
+
+    Attributes:
+        precision: of the feature network's large products, ``float32`` or ``bf16``; no property of
+            the weights, so it can be set at any time.
+    """
 
     registered_name: str
+    precision: str = "float32"
 
     def __init__(self, **arguments: Any):
         super().__init__()
@@ -91,7 +97,13 @@ class BeliefPropagationBackbone(Backbone):
 
     def features(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """(B, N, 64) source and (B, M, 64) target features."""
-        return self._network(batch.source, batch.target, batch.source_mask, batch.target_mask)
+        return self._network(
+            batch.source,
+            batch.target,
+            batch.source_mask,
+            batch.target_mask,
+            reduced=self.precision == "bf16",
+        )
 
     def forward(self, batch: Batch) -> Registration:
         source_features, target_features = self.features(batch)

@@ -34,7 +34,7 @@ def instance_norm(x: Tensor, mask: Tensor | None = None, slope: float = 1.0) -> 
 def instance_norm_eager(x: Tensor, mask: Tensor | None = None, slope: float = 1.0) -> Tensor:
     """:func:`instance_norm` in plain PyTorch, on any device."""
     mean, scale = _statistics(x, mask)
-    return F.leaky_relu((x - mean) * scale, slope)
+    return F.leaky_relu((x - mean) * scale, slope).to(x.dtype)
 
 
 def linear_maximum(x: Tensor, weight: Tensor, group: int, mask: Tensor | None = None) -> Tensor:
@@ -69,7 +69,11 @@ def normalised_maximum(x: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def _statistics(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Mean and 1/√(variance + eps) over the valid points of (B, L, C): both (B, 1, C)."""
+    """Mean and 1/√(variance + eps) over the valid points of (B, L, C): both (B, 1, C).
+
+    At least in float32, whatever the precision of x.
+    """
+    x = x.float() if x.dtype == torch.bfloat16 else x
     if mask is None:
         variance, mean = torch.var_mean(x, dim=1, keepdim=True, correction=0)
     else:
@@ -132,14 +136,16 @@ class EdgeConv(nn.Module):
         # W·[f_j − f_i, f_i] = W₁f_j + (W₂ − W₁)f_i: two products on points instead of one on edges.
         weight = self.conv[0].weight.flatten(1)
         near, own = weight[:, :channels], weight[:, channels:]
-        near, own = F.linear(x, near), F.linear(x, own - near)
+        with torch.autocast(x.device.type, enabled=False):
+            # Neighbours' differences would not survive rounding; and these products are small.
+            near, own = F.linear(x, near), F.linear(x, own - near)
         middle, last = (self.conv[i].weight.flatten(1) for i in (3, 6))
         if edges is not None:
             x = EdgeConvolution.apply(near, own, middle, last, edges, self.SLOPE, NORM_EPS)
         else:
             x = edge_convolution(near, own, middle, last, neighbours, self.SLOPE)
         # LeakyReLU, too, commutes with the maximum.
-        return F.leaky_relu(x, self.SLOPE)
+        return F.leaky_relu(x, self.SLOPE).to(near.dtype)
 
 
 def edge_convolution(
@@ -149,8 +155,8 @@ def edge_convolution(
     index, mask = neighbours.index, neighbours.mask
     mask = None if mask is None else mask.flatten(1)
     edges = gather_points(near, index.flatten(1)).unflatten(1, index.shape[1:])
-    edges = instance_norm((edges + own.unsqueeze(2)).flatten(1, 2), mask, slope)
-    edges = instance_norm(F.linear(edges, middle), mask, slope)
+    edges = instance_norm_eager((edges + own.unsqueeze(2)).flatten(1, 2), mask, slope)
+    edges = instance_norm_eager(F.linear(edges, middle), mask, slope)
     return normalised_maximum(F.linear(edges, last).unflatten(1, index.shape[1:]), mask)
 
 
@@ -205,18 +211,28 @@ class FeatureNetwork(nn.Module):
         target: Tensor,
         source_mask: Tensor | None = None,
         target_mask: Tensor | None = None,
+        reduced: bool = False,
     ) -> tuple[Tensor, Tensor]:
-        """(B, N, 3) and (B, M, 3) clouds to (B, N, 64) and (B, M, 64) features."""
-        source = self._local(source, self.source_neighbours, source_mask)
-        target = self._local(target, self.target_neighbours, target_mask)
-        if self.transform is not None:
-            source, target = self.transform(source, target, source_mask, target_mask)
+        """(B, N, 3) and (B, M, 3) clouds to (B, N, 64) and (B, M, 64) features.
+
+        ``reduced`` does the large products, on edges and in the transformer, in bfloat16;
+        positions, norms and the head stay in the clouds' own type.
+        """
+        kind = source.dtype
+        with torch.autocast(source.device.type, torch.bfloat16, enabled=reduced):
+            source = self._local(source, self.source_neighbours, source_mask)
+            target = self._local(target, self.target_neighbours, target_mask)
+            if self.transform is not None:
+                source, target = self.transform(source, target, source_mask, target_mask)
+        source, target = source.to(kind), target.to(kind)
         return self._head(source, source_mask), self._head(target, target_mask)
 
     def _local(self, x: Tensor, k: int, mask: Tensor | None) -> Tensor:
-        x = x @ self.input_transform(x, mask)
+        with torch.autocast(x.device.type, enabled=False):
+            x = x @ self.input_transform(x, mask)
         neighbours = nearest_neighbours(x, x, k, mask, mask)
-        edges = Edges(neighbours) if compiled.supported(x) else None
+        reduced = torch.is_autocast_enabled(x.device.type)
+        edges = Edges(neighbours) if compiled.supported(x) and not reduced else None
         for layer in (self.conv1, self.conv2, self.conv3):
             x = layer(x, neighbours, edges)
         return x
