@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import os
@@ -55,9 +56,6 @@ def settings_option(model: type[config.Section]):
 
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 name_option = click.option("--name", default="", help="Shown with the progress.")
-device_option = click.option(
-    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", show_default=True
-)
 batch_option = click.option(
     "--batch-size", type=click.IntRange(1), default=4, show_default=True, help="Pairs at a time."
 )
@@ -68,10 +66,42 @@ pairs_option = click.option("--pairs", type=IN, required=True, help="Pairs (HDF5
 model_option = click.option("--model", type=IN, required=True, help="Weights (safetensors).")
 
 
+def compute_options(*names: str):
+    """Options for some of the keys of ``Compute``, given to the command as ``compute``."""
+    kinds = {
+        "device": click.Choice(["auto", "cpu", "cuda"]),
+        "precision": click.Choice(["float32", "bf16"]),
+        "processes": click.IntRange(1),
+    }
+
+    def decorate(command):
+        @functools.wraps(command)
+        def run(**values):
+            compute = config.Compute(**{name: values.pop(name) for name in names})
+            return command(**values, compute=compute)
+
+        for name in reversed(names):
+            field = config.Compute.model_fields[name]
+            run = click.option(
+                f"--{name}",
+                type=kinds[name],
+                default=field.default,
+                show_default=True,
+                help=field.description,
+            )(run)
+        return run
+
+    return decorate
+
+
+prediction_options = compute_options("device", "precision")
+training_options = compute_options("device", "precision", "processes")
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
 @click.version_option(__version__, prog_name="dine")
 @click.option("--log", "log_file", type=OUT, help="Also write the log to this file.")
-@click.option("--threads", type=click.IntRange(1), help="Threads for numerical work.")
+@click.option("--threads", type=click.IntRange(1), help="Threads for all processes together.")
 def cli(log_file: Path | None, threads: int | None):
     """Non-rigid registration of point clouds with learned deformation priors."""
     handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
@@ -231,10 +261,10 @@ backbone_option = click.option(
 @backbone_option
 @settings_option(config.Stage1)
 @seed_option
-@device_option
+@training_options
 @name_option
 @click.option("--out", type=FOLDER, required=True, help="Run folder.")
-def stage1(pairs, backbone, settings, seed, device, name, out):
+def stage1(pairs, backbone, settings, seed, compute, name, out):
     """Train a backbone on the Chamfer distance alone.
 
     Example: dine stage1 --pairs pairs.h5 --settings '{"steps": 1000}' --out runs/stage1
@@ -250,7 +280,7 @@ def stage1(pairs, backbone, settings, seed, device, name, out):
         seed=seed,
         out=out,
         name=name or f"stage 1 {backbone.kind}",
-        device=device,
+        compute=compute,
     )
 
 
@@ -259,9 +289,9 @@ def stage1(pairs, backbone, settings, seed, device, name, out):
 @backbone_option
 @settings_option(config.Pretraining)
 @seed_option
-@device_option
+@training_options
 @click.option("--out", type=FOLDER, required=True, help="Run folder.")
-def pretrain(pairs, backbone, settings, seed, device, out):
+def pretrain(pairs, backbone, settings, seed, compute, out):
     """Train weights to start Stage 1 from, on synthetic pairs with known displacement."""
     from dine.training import stages
 
@@ -273,7 +303,7 @@ def pretrain(pairs, backbone, settings, seed, device, out):
         settings,
         seed=seed,
         out=out,
-        device=device,
+        compute=compute,
     )
 
 
@@ -281,16 +311,16 @@ def pretrain(pairs, backbone, settings, seed, device, out):
 @model_option
 @pairs_option
 @batch_option
-@device_option
+@prediction_options
 @name_option
 @click.option("--out", type=OUT, required=True, help="Fields to write (HDF5).")
-def fields(model, pairs, batch_size, device, name, out):
+def fields(model, pairs, batch_size, compute, name, out):
     """Write a model's displacement fields of the training split."""
     from dine.training import stages
 
     _start_torch()
     stages.dump_fields(
-        model, pairs, out, name=name or "fields", batch_size=batch_size, device=device
+        model, pairs, out, name=name or "fields", batch_size=batch_size, compute=compute
     )
 
 
@@ -325,15 +355,15 @@ stage2_option = click.option(
 @stage2_option
 @settings_option(config.LambdaSearch)
 @seed_option
-@device_option
+@training_options
 @click.option("--out", type=OUT, required=True, help="Result (JSON).")
-def search_lambda(pairs, model, priors, stage2_settings, settings, seed, device, out):
+def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute, out):
     """Choose λ on validation pairs."""
     from dine.training import stages
 
     _start_torch()
     stages.search_lambda(
-        pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, device=device
+        pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, compute=compute
     )
 
 
@@ -345,10 +375,10 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, device,
 @click.option("--lambda", "weight", help="A number, or the file of `dine search-lambda`.")
 @settings_option(config.Stage2)
 @seed_option
-@device_option
+@training_options
 @name_option
 @click.option("--out", type=FOLDER, required=True, help="Run folder.")
-def stage2(pairs, model, variant, prior, weight, settings, seed, device, name, out):
+def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, out):
     """Refine a Stage-1 model with λ times a frozen prior; without a prior, the λ = 0 control."""
     from dine.training import stages
 
@@ -372,7 +402,7 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, device, name, o
         seed=seed,
         out=out,
         name=name or f"stage 2 {variant}",
-        device=device,
+        compute=compute,
     )
 
 
@@ -384,10 +414,10 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, device, name, o
 @pairs_option
 @variants_option
 @batch_option
-@device_option
+@prediction_options
 @name_option
 @click.option("--out", type=OUT, required=True, help="Predictions to write (HDF5).")
-def predict(model, pairs, variants, batch_size, device, name, out):
+def predict(model, pairs, variants, batch_size, compute, name, out):
     """Register the test split and its corrupted variants; write the displacement fields."""
     from dine.evaluation.predict import predict as run
 
@@ -399,7 +429,7 @@ def predict(model, pairs, variants, batch_size, device, name, out):
         out,
         name=name or "predict",
         batch_size=batch_size,
-        device=device,
+        compute=compute,
     )
 
 

@@ -190,7 +190,7 @@ class Training(Section):
     steps: Count = 400
     """Optimiser steps."""
     batch_size: Count = 1
-    """Pairs per step."""
+    """Pairs per step, over all processes."""
     learning_rate: Positive = 3.0e-4
     schedule: Literal["constant", "cosine"] = "cosine"
     """Learning rate over the steps; `cosine` falls to a hundredth."""
@@ -246,17 +246,26 @@ class Pretraining(Training):
     """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
 
 
-class Config(Section):
+class Compute(Section):
+    """How a step computes, which is the same for all of them."""
+
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """`auto` takes a CUDA device where there is one."""
+    processes: Count = 1
+    """Processes of each training, which share every batch; on CUDA each has its own device."""
+    precision: Literal["float32", "bf16"] = "float32"
+    """Of the feature network's large products; the rest is always in float32."""
+
+
+class Config(Compute):
     """The whole configuration."""
 
     results: str = "results"
     """Folder of all outputs."""
     seed: Annotated[int, BeforeValidator(_no_bool), Field(ge=0, lt=2**31)] = 0
     """Seed of data, initial weights and training order."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """`auto` takes a CUDA device where there is one."""
     threads: Count = 1
-    """Threads of each training or prediction; Snakemake's -j shares them out."""
+    """Threads of each process of a training or prediction; Snakemake's -j shares them out."""
     datasets: dict[str, Dataset] = Field(default={}, min_length=1)
     backbones: dict[str, BackboneConfig] = Field(default={}, min_length=1)
     priors: dict[str, PriorConfig] = Field(default={}, min_length=1)
@@ -288,6 +297,9 @@ class Config(Section):
             self._known("priors", prior, "lambda_search.priors")
         for name, prior in self.priors.items():
             check_arguments(prior, f"priors.{name}.arguments")
+        for stage in ("stage1", "stage2"):
+            batch_size = getattr(self, stage).batch_size
+            check_shares(batch_size, self.processes, f"{stage}.batch_size")
         return self
 
     def _known(self, section: str, name: str, where: str) -> None:
@@ -301,6 +313,15 @@ class Config(Section):
     def methods(self, backbone: str) -> list[str]:
         """What is evaluated for a backbone: Stage 1, the control, then its priors."""
         return [STAGE1, CONTROL, *self.backbones[backbone].priors]
+
+
+def check_shares(batch_size: int, processes: int, where: str = "batch_size") -> None:
+    """Every process takes as many pairs of a batch as the others."""
+    if batch_size % processes:
+        raise ValueError(
+            f"`{where}` is {batch_size}, which {processes} processes cannot share equally; make it "
+            "a multiple of `processes`"
+        )
 
 
 PRIOR_ARGUMENTS: dict[str, type[Section]] = {"pca": PCAArguments, "flow": FlowArguments}

@@ -16,17 +16,20 @@ LOG_SECONDS = 10.0
 class Progress:
     """A bar on an interactive terminal and, every ten seconds, a line in the log.
 
-    Use as a context manager; call :meth:`update` after each unit of work.
+    Use as a context manager; call :meth:`update` after each unit of work. With ``quiet`` there is
+    no bar.
     """
 
-    def __init__(self, name: str, total: int, done: int = 0, unit: str = "step"):
+    def __init__(
+        self, name: str, total: int, done: int = 0, unit: str = "step", quiet: bool = False
+    ):
         self.name, self.total, self.done, self.unit = name, total, done, unit
         self._bar = tqdm(
             total=total,
             initial=done,
             desc=name,
             unit=unit,
-            disable=not sys.stderr.isatty(),
+            disable=quiet or not sys.stderr.isatty(),
             dynamic_ncols=True,
             leave=False,
         )

@@ -27,13 +27,27 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "data/sampling.py",
         "data/dataverse.py",
     ),
-    "pairs": (*_READING, "data/prepare.py", "data/pairs.py", "data/sampling.py"),
+    "pairs": (
+        *_READING,
+        "data/prepare.py",
+        "data/pairs.py",
+        "data/sampling.py",
+        "data/assignment.py",
+    ),
     "corrupt": ("data/corruption.py", "data/pairs.py"),
-    "model": ("data/batch.py", "data/pairs.py", "data/fields.py", "geometry", "models"),
+    "model": (
+        "data/batch.py",
+        "data/loading.py",
+        "data/pairs.py",
+        "data/fields.py",
+        "geometry",
+        "models",
+    ),
     "priors": ("priors",),
     "training": ("training",),
     "evaluation": ("evaluation",),
     "reporting": ("reporting",),
+    "registration": ("registration",),
 }
 
 

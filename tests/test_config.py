@@ -66,6 +66,8 @@ def test_schema_file_is_in_step_with_the_code():
         ("stage1.learning_rate", -1.0, r"`stage1\.learning_rate` is -1\.0: .*greater than 0"),
         ("seed", True, "`seed`: expected a number, found True"),
         ("device", "gpu", r"`device` is 'gpu': .*'auto', 'cpu' or 'cuda'"),
+        ("precision", "half", r"`precision` is 'half': .*'float32' or 'bf16'"),
+        ("processes", 2, r"`stage1\.batch_size` is 1, which 2 processes cannot share equally"),
         ("datasets.synbench.recipe.levels", [], r"levels` is \[\]"),
         ("datasets.synbench.recipe.levels", [0.1, "x"], r"levels\.1`: expected a number"),
         ("datasets.synbench.recipe.pairs_per_level", 10, "only 9 different deformations"),

@@ -1,6 +1,7 @@
 """The whole chain, from generated meshes to metrics, through the commands a user would call."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -138,18 +139,40 @@ def test_equal_runs_give_equal_bytes(chain, tmp_path):
     assert (tmp_path / "model.safetensors").read_bytes() == first
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, number):
-    settings = json.loads(STAGE1) | {"steps": 25, "validate_every": 25, "save_seconds": 0.001}
+def test_precision_is_recorded_and_part_of_the_identity(chain, tmp_path):
+    train = ("stage1", "--pairs", chain / "pairs.h5", "--settings", STAGE1, "--out", tmp_path)
+    dine(*train)
+    dine(*train, "--precision", "bf16")
+    exact, reduced = read_json(chain / "stage1" / "run.json"), read_json(tmp_path / "run.json")
+    assert (exact["precision"], reduced["precision"]) == ("float32", "bf16")
+    assert exact["final"]["val_cd"] != reduced["final"]["val_cd"]
+    model = ("--model", chain / "stage1" / "model.safetensors", "--pairs", chain / "pairs.h5")
+    dine("fields", *model, "--precision", "bf16", "--out", tmp_path / "dvf.h5")
+    error = np.abs(read_fields(tmp_path / "dvf.h5") - read_fields(chain / "dvf.h5")).max()
+    assert 0 < error < 0.5
+
+
+def start_training(chain, out, processes):
+    """The command of a training, and its process as soon as a state of it has been saved."""
+    settings = json.loads(STAGE1) | {"steps": 40, "batch_size": 2, "save_seconds": 0.001}
+    settings["validate_every"] = settings["steps"]
     command = [
-        *(sys.executable, "-m", "dine", "--threads", "1", "stage1", "--out", tmp_path / "killed"),
+        *(sys.executable, "-m", "dine", "--threads", "1", "stage1", "--out", out),
         *("--pairs", chain / "pairs.h5", "--settings", json.dumps(settings)),
+        *("--device", "cpu", "--processes", str(processes)),
     ]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    history = tmp_path / "killed" / "training" / "history.csv"
+    history = out / "training" / "history.csv"
     give_up = time.monotonic() + 60
     while not history.exists() and time.monotonic() < give_up:
         time.sleep(0.01)
+    return command, process
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, number, processes):
+    command, process = start_training(chain, tmp_path / "killed", processes)
     process.send_signal(number)
     error = process.communicate()[1]
     assert process.returncode == (1 if number == signal.SIGTERM else -number)
@@ -161,6 +184,19 @@ def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, 
     subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
     whole = (tmp_path / "whole" / "model.safetensors").read_bytes()
     assert (tmp_path / "killed" / "model.safetensors").read_bytes() == whole
+    assert read_json(tmp_path / "whole" / "run.json")["processes"] == processes
+
+
+def test_one_of_several_processes_dies(chain, tmp_path):
+    command, process = start_training(chain, tmp_path, 2)
+    leader = int((tmp_path / "training" / "holder.txt").read_text().split()[-1])
+    assert leader != process.pid
+    os.kill(leader, signal.SIGKILL)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 1
+    assert "Process 1 of 2 died (SIGKILL); run the same command again" in error
+    again = subprocess.run(command, check=True, stderr=subprocess.PIPE, text=True)
+    assert "going on from step" in again.stderr
 
 
 def test_predictions_and_metrics(chain, tmp_path):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,13 +38,22 @@ class Batch:
     def __len__(self) -> int:
         return len(self.source)
 
-    def to(self, device: torch.device | str) -> Batch:
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Batch:
         """The same batch with every tensor on ``device``."""
+        return _with_tensors(self, lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
-        def move(value):
-            return None if value is None else value.to(device)
+    def pin_memory(self) -> Batch:
+        """The same batch in memory that a GPU can fetch from while the CPU goes on."""
+        return _with_tensors(self, torch.Tensor.pin_memory)
 
-        return Batch(*(move(value) for value in vars(self).values()))
+
+def _with_tensors(value: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """A dataclass with every tensor in it changed, those of nested dataclasses too."""
+    if isinstance(value, Tensor):
+        return change(value)
+    if not is_dataclass(value):
+        return value
+    return type(value)(*(_with_tensors(getattr(value, f.name), change) for f in fields(value)))
 
 
 def make_batch(

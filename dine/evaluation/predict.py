@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from dine.config import Compute
 from dine.data.fields import put_fields
 from dine.data.pairs import read_pairs, read_variant
 from dine.errors import DataError
@@ -14,7 +15,7 @@ from dine.evaluation.predictions import FORMAT
 from dine.files import atomic_path, file_digest
 from dine.models.checkpoint import load_backbone
 from dine.results import CLEAN, condition_key
-from dine.training.stages import predict_fields
+from dine.training.stages import COMPUTE, predict_fields
 
 
 def predict(
@@ -25,7 +26,7 @@ def predict(
     *,
     name: str,
     batch_size: int = 4,
-    device: str = "auto",
+    compute: Compute = COMPUTE,
 ) -> None:
     """Predict the clean test split and its corrupted variants, and write all fields to HDF5."""
     backbone, _ = load_backbone(model)
@@ -47,7 +48,7 @@ def predict(
                 pairs,
                 name=f"{name} {key}",
                 batch_size=batch_size,
-                device=device,
+                compute=compute,
                 targets=targets,
             )
             group = file.create_group(key)

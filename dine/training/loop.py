@@ -6,7 +6,9 @@ takes exactly the steps that an undisturbed one would have taken.
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import functools
 import io
 import logging
 import math
@@ -18,74 +20,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from dine.config import Training
-from dine.data.batch import GRAPH_NEIGHBOURS, Batch, make_batch
+from dine.config import Training, check_shares
+from dine.data.loading import Batches, Request
 from dine.data.pairs import PairSet
-from dine.errors import DataError, DineError
+from dine.errors import ConfigError, DataError, DineError
 from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
-from dine.geometry.graph import Graph, neighbour_graph
 from dine.models.backbones import Backbone
 from dine.progress import Progress
-from dine.training.objective import Objective
+from dine.training.objective import Loss, Objective
+from dine.training.parallel import Alone, Team, chosen_device, run_together
 from dine.training.state import Interrupted, StopRequest, load_state, one_writer, save_state
 
 log = logging.getLogger(__name__)
 
-HISTORY_COLUMNS = ("step", "loss", "data", "penalty", "grad_norm", "learning_rate", "seconds")
+STATE = "state.pt"
+MEASURED = ("loss", "data", "penalty", "grad_norm")
+HISTORY_COLUMNS = ("step", *MEASURED, "learning_rate", "seconds")
 VALIDATION_COLUMNS = ("val_cd", "val_mce")
-
-
-class Batches:
-    """Batches of a pair set, with the sources' graphs made once per distinct source."""
-
-    def __init__(self, pairs: PairSet, device: torch.device):
-        self.pairs = pairs
-        self.device = device
-        self._graphs: dict[bytes, Graph] = {}
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def _graph(self, index: int) -> Graph:
-        source = self.pairs.source[index]
-        key = source.tobytes()
-        if key not in self._graphs:
-            self._graphs[key] = neighbour_graph(source, GRAPH_NEIGHBOURS)
-        return self._graphs[key]
-
-    def get(
-        self,
-        indices: np.ndarray,
-        rng: np.random.Generator | None = None,
-        targets: np.ndarray | None = None,
-    ) -> tuple[Batch, torch.Tensor]:
-        """A batch and its true displacements (B, N, 3).
-
-        With ``rng`` every target's point order is shuffled, so that a network cannot learn the
-        correspondence from the order. ``targets`` (P, M, 3) stands in for the clean targets.
-        """
-        clouds = [(self.pairs.target if targets is None else targets)[i] for i in indices]
-        if rng is not None:
-            clouds = [cloud[rng.permutation(len(cloud))] for cloud in clouds]
-        batch = make_batch(
-            [self.pairs.source[i] for i in indices], clouds, [self._graph(i) for i in indices]
-        )
-        truth = torch.from_numpy(self.pairs.target[indices] - self.pairs.source[indices])
-        return batch.to(self.device), truth.to(self.device)
-
-
-def chosen_device(name: str) -> torch.device:
-    """``auto``, ``cpu`` or ``cuda`` as a device.
-
-    Raises:
-        DineError: ``cuda`` where there is none.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise DineError("The device 'cuda' was asked for, but no CUDA device is available here.")
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
 
 
 def order_of(step: int, batch_size: int, count: int, seed: int) -> np.ndarray:
@@ -94,6 +46,15 @@ def order_of(step: int, batch_size: int, count: int, seed: int) -> np.ndarray:
     epochs = positions // count
     orders = {e: np.random.default_rng([seed, 0, e]).permutation(count) for e in np.unique(epochs)}
     return np.array([orders[e][p] for e, p in zip(epochs, positions % count, strict=True)])
+
+
+def share_of(team: Team, step: int, batch_size: int, count: int, seed: int) -> Request:
+    """What one process takes of a step's batch."""
+    positions = np.split(np.arange(batch_size), team.size)[team.rank]
+    return (
+        order_of(step, batch_size, count, seed)[positions],
+        [(seed, 1, step, position) for position in positions],
+    )
 
 
 def learning_rate(settings: Training, step: int) -> float:
@@ -113,15 +74,16 @@ def spread(count: int, wanted: int) -> np.ndarray:
 def validate(backbone: Backbone, batches: Batches, wanted: int) -> dict[str, float]:
     """Mean Chamfer distance and correspondence error over some validation pairs."""
     backbone.eval()
-    distances, errors = [], []
-    for index in spread(len(batches), wanted):
-        batch, truth = batches.get(np.array([index]), np.random.default_rng([1, index]))
+    values = []
+    requests = (([index], [(1, index)]) for index in spread(len(batches), wanted))
+    for batch, truth in batches.stream(requests):
         displacement = backbone(batch).displacement
-        moved = batch.source + displacement
-        distances.append(chamfer_distance(moved, batch.target).item())
-        errors.append((displacement - truth).norm(dim=-1).mean().item())
+        distance = chamfer_distance(batch.source + displacement, batch.target)
+        error = (displacement - truth).norm(dim=-1)
+        values.append(torch.stack([distance.mean(), error.mean()]))
     backbone.train()
-    return {"val_cd": float(np.mean(distances)), "val_mce": float(np.mean(errors))}
+    distance, error = np.mean(torch.stack(values).tolist(), axis=0).tolist()
+    return {"val_cd": distance, "val_mce": error}
 
 
 def history_csv(history: list[dict[str, Any]]) -> str:
@@ -148,6 +110,7 @@ def train(
     identity: dict[str, str],
     name: str,
     device: str = "auto",
+    processes: int = 1,
     on_step: Callable[[int], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Train in place, resuming from ``folder`` when its state has the same ``identity``.
@@ -163,6 +126,8 @@ def train(
         identity: digests that a saved state must share to be used (settings, inputs, code).
         name: shown with the progress.
         device: ``auto``, ``cpu`` or ``cuda``.
+        processes: that share every batch; on CUDA each has a device of its own. Their number
+            changes the result by rounding only, and is no part of the identity.
         on_step: called after each step (tests interrupt there).
 
     Returns:
@@ -171,21 +136,67 @@ def train(
 
     Raises:
         Interrupted: SIGTERM or SIGINT came; the state is saved.
-        DineError: the folder is in use, or the loss stopped being finite.
+        ConfigError: the processes cannot share a batch equally.
+        DineError: the folder is in use, a process died, or the loss stopped being finite.
     """
     for split, pairs in (("train", train_pairs), ("validation", val_pairs)):
         if len(pairs) == 0:
             raise DataError(f"There are no {split} pairs; the dataset has too few base objects.")
-    target = chosen_device(device)
-    backbone.to(target).train()
-    if objective.prior is not None:
-        objective.prior.to(target)
-    optimiser = torch.optim.AdamW(
-        backbone.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
+    try:
+        check_shares(settings.batch_size, processes)
+    except ValueError as error:
+        raise ConfigError(f"{error}.") from None
+    work = functools.partial(
+        _train,
+        backbone=backbone,
+        objective=objective,
+        train_pairs=train_pairs,
+        val_pairs=val_pairs,
+        settings=settings,
+        seed=seed,
+        folder=folder,
+        identity=identity,
+        name=name,
+        on_step=on_step,
     )
-    batches, val_batches = Batches(train_pairs, target), Batches(val_pairs, target)
-    path = folder / "state.pt"
-    with one_writer(folder):
+    if processes == 1:
+        with StopRequest() as stop:
+            return work(Alone(chosen_device(device), stop))
+    run_together(processes, chosen_device(device), work)
+    state, _ = load_state(folder / STATE, identity)
+    backbone.load_state_dict(state["model"])
+    return state["history"]
+
+
+def _train(
+    team: Team,
+    *,
+    backbone: Backbone,
+    objective: Objective,
+    train_pairs: PairSet,
+    val_pairs: PairSet,
+    settings: Training,
+    seed: int,
+    folder: Path,
+    identity: dict[str, str],
+    name: str,
+    on_step: Callable[[int], None] | None,
+) -> list[dict[str, Any]]:
+    """One process's part of :func:`train`."""
+    backbone.to(team.device).train()
+    if objective.prior is not None:
+        objective.prior.to(team.device)
+    optimiser = torch.optim.AdamW(
+        backbone.parameters(),
+        lr=settings.learning_rate,
+        weight_decay=settings.weight_decay,
+        fused=True,
+    )
+    batches = Batches(train_pairs, team.device)
+    val_batches = Batches(val_pairs, team.device)
+    path = folder / STATE
+    with one_writer(folder) if team.leads else contextlib.nullcontext():
+        team.wait()  # until the folder is ours
         state, message = load_state(path, identity)
         log.info("%s: %s", name, message)
         start, history = 0, []
@@ -193,6 +204,7 @@ def train(
             backbone.load_state_dict(state["model"])
             optimiser.load_state_dict(state["optimiser"])
             start, history = state["step"], state["history"]
+        loss_of = team.share(Loss(backbone, objective))
 
         def save(step: int) -> None:
             save_state(
@@ -210,43 +222,52 @@ def train(
         saved = time.monotonic()
         elapsed = history[-1]["seconds"] if history else 0.0
         began = time.monotonic() - elapsed
-        with StopRequest() as stop, Progress(name, settings.steps, start) as progress:
-            for step in range(start, settings.steps):
+        steps = range(start, settings.steps)
+        stream = batches.stream(
+            share_of(team, step, settings.batch_size, len(batches), seed) for step in steps
+        )
+        with (
+            contextlib.closing(stream),
+            Progress(name, settings.steps, start, quiet=not team.leads) as progress,
+        ):
+            for step, (batch, truth) in zip(steps, stream, strict=True):
                 rate = learning_rate(settings, step)
                 for group in optimiser.param_groups:
                     group["lr"] = rate
-                indices = order_of(step, settings.batch_size, len(batches), seed)
-                batch, truth = batches.get(indices, np.random.default_rng([seed, 1, step]))
-                loss, parts = objective(batch, backbone(batch).displacement, truth)
+                loss, data, penalty = loss_of(batch, truth)
                 optimiser.zero_grad(set_to_none=True)
                 loss.backward()
                 norm = torch.nn.utils.clip_grad_norm_(backbone.parameters(), settings.clip)
-                value = loss.item()
-                if not math.isfinite(value + norm.item()):
+                # All numbers in one transfer: on a GPU each of its own would stall the step.
+                values = team.mean(torch.stack([loss.detach(), data, penalty, norm]))
+                measured = dict(zip(MEASURED, values, strict=True))
+                if not all(map(math.isfinite, values)):
                     raise DineError(
-                        f"{name} diverged at step {step}: loss {value}, gradient norm "
-                        f"{norm.item()}; lower learning_rate or the prior's weight."
+                        f"{name} diverged at step {step}: loss {measured['loss']}, gradient norm "
+                        f"{measured['grad_norm']}; lower learning_rate or the prior's weight."
                     )
                 optimiser.step()
                 row = {
                     "step": step + 1,
-                    "loss": value,
-                    **parts,
-                    "grad_norm": norm.item(),
+                    **measured,
                     "learning_rate": rate,
                     "seconds": time.monotonic() - began,
                 }
-                last = step + 1 == settings.steps
-                if last or (step + 1) % settings.validate_every == 0:
-                    row |= validate(backbone, val_batches, settings.validation_pairs)
                 history.append(row)
-                progress.update(1, loss=np.mean([r["loss"] for r in history[-50:]]))
-                if on_step is not None:
-                    on_step(step)
-                if last or stop.signal or time.monotonic() - saved > settings.save_seconds:
+                last = step + 1 == settings.steps
+                if team.leads:
+                    if last or (step + 1) % settings.validate_every == 0:
+                        row |= validate(backbone, val_batches, settings.validation_pairs)
+                    progress.update(1, loss=np.mean([r["loss"] for r in history[-50:]]))
+                    if on_step is not None:
+                        on_step(step)
+                stopping = team.stopping
+                late = time.monotonic() - saved > settings.save_seconds
+                if team.leads and (last or late or stopping):
                     save(step + 1)
                     saved = time.monotonic()
-                if stop.signal and not last:
+                if stopping and not last:
+                    team.wait()  # until the state is saved
                     raise Interrupted(
                         f"{name} was stopped after step {step + 1} of {settings.steps}; run the "
                         "same command again to go on from there."

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torch import Tensor
+import torch
+from torch import Tensor, nn
 
 from dine.data.batch import Batch
 from dine.errors import ConfigError
 from dine.geometry.chamfer import chamfer_distance, masked_mean
+from dine.models.backbones import Backbone
 from dine.priors.base import Prior
 from dine.registry import Registry
 
@@ -61,10 +63,22 @@ class Objective:
 
     def __call__(
         self, batch: Batch, displacement: Tensor, truth: Tensor | None
-    ) -> tuple[Tensor, dict[str, float]]:
-        """The loss (a scalar) and its parts as numbers."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The loss, and without gradient what it consists of: data term and penalty; scalars."""
         data = self.data_term(batch, displacement, truth).mean()
         if self.prior is None or self.weight == 0:
-            return data, {"data": data.item(), "penalty": 0.0}
+            return data, data.detach(), torch.zeros_like(data)
         penalty = self.prior.penalty(displacement, batch.source_mask).mean()
-        return data + self.weight * penalty, {"data": data.item(), "penalty": penalty.item()}
+        return data + self.weight * penalty, data.detach(), penalty.detach()
+
+
+class Loss(nn.Module):
+    """From a batch to an objective's values: one module, as data-parallel training needs it."""
+
+    def __init__(self, backbone: Backbone, objective: Objective):
+        super().__init__()
+        self.backbone = backbone
+        self.objective = objective
+
+    def forward(self, batch: Batch, truth: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+        return self.objective(batch, self.backbone(batch).displacement, truth)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ import torch
 
 from dine.config import (
     CONTROL,
+    Compute,
     LambdaSearch,
     PriorConfig,
     Stage1,
@@ -21,6 +23,7 @@ from dine.config import (
     check_arguments,
 )
 from dine.data.fields import FIELDS_FORMAT, put_fields, read_fields
+from dine.data.loading import Batches
 from dine.data.pairs import PairSet, read_pairs
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
@@ -29,10 +32,13 @@ from dine.models.checkpoint import load_backbone, save_backbone
 from dine.priors import PRIORS, load_prior
 from dine.progress import Progress
 from dine.provenance import code_digest, run_record
-from dine.training.loop import Batches, chosen_device, history_csv, train
+from dine.training.loop import history_csv, train
 from dine.training.objective import DATA_TERMS, Objective
+from dine.training.parallel import chosen_device
 
 log = logging.getLogger(__name__)
+
+COMPUTE = Compute()
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
@@ -92,7 +98,7 @@ def _run(
     seed: int,
     out: Path,
     name: str,
-    device: str,
+    compute: Compute,
     inputs: dict[str, Any],
     facts: dict[str, Any],
 ) -> None:
@@ -103,11 +109,13 @@ def _run(
         "settings": digest(settings.model_dump()),
         "backbone": digest([backbone.registered_name, backbone.arguments]),
         "seed": str(seed),
+        "precision": compute.precision,
         "inputs": digest(inputs),
         "code": code_digest("model", "training", *(["priors"] if objective.prior else [])),
     }
     train_pairs = PairSet.concatenate([read_pairs(path, split="train") for path in pairs_paths])
     val_pairs = PairSet.concatenate([read_pairs(path, split="val") for path in pairs_paths])
+    backbone.precision = compute.precision
     began = time.monotonic()
     history = train(
         backbone,
@@ -119,7 +127,8 @@ def _run(
         folder=out / "training",
         identity=identity,
         name=name,
-        device=device,
+        device=compute.device,
+        processes=compute.processes,
     )
     # Weights carry nothing that differs between two equal runs, so they can be compared by bytes.
     save_backbone(out / "model.safetensors", backbone, name=name, seed=seed, steps=settings.steps)
@@ -130,7 +139,9 @@ def _run(
             settings.model_dump(),
             seed,
             name=name,
-            device=str(chosen_device(device)),
+            device=str(chosen_device(compute.device)),
+            processes=compute.processes,
+            precision=compute.precision,
             threads=torch.get_num_threads(),
             train_pairs=len(train_pairs),
             val_pairs=len(val_pairs),
@@ -153,7 +164,7 @@ def stage1(
     seed: int,
     out: Path,
     name: str,
-    device: str = "auto",
+    compute: Compute = COMPUTE,
 ) -> None:
     """Train a backbone on the data term alone."""
     backbone = starting_backbone(kind, arguments, settings.start, seed)
@@ -168,7 +179,7 @@ def stage1(
         seed=seed,
         out=out,
         name=name,
-        device=device,
+        compute=compute,
         inputs={"start": start},
         facts={"stage": 1, "backbone": kind, "arguments": backbone.arguments},
     )
@@ -182,7 +193,7 @@ def pretrain(
     *,
     seed: int,
     out: Path,
-    device: str = "auto",
+    compute: Compute = COMPUTE,
 ) -> None:
     """Train weights to start from, on the true displacements of synthetic pairs."""
     _run(
@@ -193,7 +204,7 @@ def pretrain(
         seed=seed,
         out=out,
         name=f"pretraining/{kind}",
-        device=device,
+        compute=compute,
         inputs={"start": "random"},
         facts={"stage": 0, "backbone": kind, "data": "synthetic", "arguments": arguments},
     )
@@ -206,7 +217,7 @@ def predict_fields(
     *,
     name: str,
     batch_size: int = 4,
-    device: str = "auto",
+    compute: Compute = COMPUTE,
     targets: np.ndarray | None = None,
 ) -> np.ndarray:
     """Displacement fields of all pairs, (P, N, 3) float32, in the pairs' order.
@@ -214,26 +225,36 @@ def predict_fields(
     ``targets`` (P, M, 3) stands in for the clean targets. Each target's points come in a shuffled
     order, as in training.
     """
-    where = chosen_device(device)
-    backbone.to(where).eval()
-    batches = Batches(pairs, where)
+    device = chosen_device(compute.device)
+    backbone.precision = compute.precision
+    backbone.to(device).eval()
+    batches = Batches(pairs, device, targets)
     fields = np.empty(pairs.source.shape, np.float32)
-    with Progress(name, len(pairs), unit="pair") as progress:
-        for start in range(0, len(pairs), batch_size):
-            index = np.arange(start, min(start + batch_size, len(pairs)))
-            batch, _ = batches.get(index, np.random.default_rng([2, start]), targets)
-            fields[index] = backbone(batch).displacement.cpu().numpy()
-            progress.update(len(index))
+    starts = range(0, len(pairs), batch_size)
+    parts = [np.arange(start, min(start + batch_size, len(pairs))) for start in starts]
+    stream = batches.stream((part, [(2, index) for index in part]) for part in parts)
+    with contextlib.closing(stream), Progress(name, len(pairs), unit="pair") as progress:
+        for part, (batch, _) in zip(parts, stream, strict=True):
+            fields[part] = backbone(batch).displacement.cpu().numpy()
+            progress.update(len(part))
     return fields
 
 
 def dump_fields(
-    model: Path, pairs: Path, out: Path, *, name: str, batch_size: int = 4, device: str = "auto"
+    model: Path,
+    pairs: Path,
+    out: Path,
+    *,
+    name: str,
+    batch_size: int = 4,
+    compute: Compute = COMPUTE,
 ) -> None:
     """Write a model's displacement fields of the training split to HDF5."""
     backbone, _ = load_backbone(model)
     train_pairs = read_pairs(pairs, split="train")
-    fields = predict_fields(backbone, train_pairs, name=name, batch_size=batch_size, device=device)
+    fields = predict_fields(
+        backbone, train_pairs, name=name, batch_size=batch_size, compute=compute
+    )
     with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(format=FIELDS_FORMAT, model=file_digest(model), pairs=file_digest(pairs))
         put_fields(file, train_pairs.name, fields)
@@ -273,7 +294,7 @@ def stage2(
     seed: int,
     out: Path,
     name: str,
-    device: str = "auto",
+    compute: Compute = COMPUTE,
 ) -> None:
     """Refine a Stage-1 model with λ times a frozen prior; ``lambda0`` is the control without."""
     if (prior is None) != (variant == CONTROL):
@@ -290,7 +311,7 @@ def stage2(
         seed=seed,
         out=out,
         name=name,
-        device=device,
+        compute=compute,
         inputs={
             "model": file_digest(model),
             "prior": file_digest(prior) if prior else None,
@@ -309,7 +330,7 @@ def search_lambda(
     *,
     seed: int,
     out: Path,
-    device: str = "auto",
+    compute: Compute = COMPUTE,
 ) -> None:
     """Try each λ on a shortened Stage 2; the lowest Chamfer distance on validation pairs wins.
 
@@ -340,7 +361,7 @@ def search_lambda(
             seed=seed,
             out=here,
             name=f"search of λ: {prior} {weight:g}",
-            device=device,
+            compute=compute,
         )
         final = read_json(here / "run.json")["final"]
         # The control is every prior's value at λ = 0.

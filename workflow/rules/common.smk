@@ -34,6 +34,10 @@ GPUS = int(
     or (CONFIG.device == "auto" and shutil.which("nvidia-smi") is not None)
 )
 THREADS = CONFIG.threads
+# A training is one job, whatever the number of its processes. Their number changes results by
+# rounding only, so it is a resource and no parameter: nothing finished is made again for it.
+PROCESSES = CONFIG.processes
+COMPUTE = f"--device {CONFIG.device} --precision {CONFIG.precision}"
 
 # Where rule logs, benchmarks and the run folder of a method lie.
 LOGS = RESULTS / "logs"

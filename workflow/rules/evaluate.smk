@@ -20,12 +20,12 @@ rule predict:
     params:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
-        device=CONFIG.device,
+        compute=COMPUTE,
         code=code_digest("model"),
     shell:
         "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
         " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
-        " --device {params.device}"
+        " {params.compute}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.run}' --out {output:q}"
 
 

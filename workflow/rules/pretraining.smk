@@ -75,20 +75,21 @@ rule pretrain:
         BENCHMARKS / "pretraining" / "{backbone}.tsv"
     conda:
         "../envs/dine.yaml"
-    threads: THREADS
+    threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS,
+        gpu=GPUS * PROCESSES,
+        processes=PROCESSES,
     params:
         pairs=lambda wildcards, input: options("--pairs", input),
         backbone=backbone_settings,
         settings=section(CONFIG.pretraining),
         seed=CONFIG.seed,
-        device=CONFIG.device,
+        compute=COMPUTE,
         code=code_digest("model", "training"),
     shell:
         "dine --log {log:q} --threads {threads} pretrain {params.pairs}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
-        ' --device {params.device} --out "$(dirname {output.model:q})"'
+        ' {params.compute} --processes {resources.processes} --out "$(dirname {output.model:q})"'
 
 
 rule pretrained:

@@ -43,18 +43,20 @@ rule search_lambda:
     priority: 40
     conda:
         "../envs/dine.yaml"
-    threads: THREADS
+    threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS,
+        gpu=GPUS * PROCESSES,
+        processes=PROCESSES,
     params:
         priors=lambda wildcards, input: options("--prior", SEARCH.priors, input.priors),
         stage2=section(CONFIG.stage2),
         settings=section(SEARCH),
         seed=CONFIG.seed,
-        device=CONFIG.device,
+        compute=COMPUTE,
         code=code_digest("model", "priors", "training"),
     shell:
         "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
         " --model {input.model:q} {params.priors} --stage2 {params.stage2:q}"
-        " --settings {params.settings:q} --seed {params.seed} --device {params.device}"
+        " --settings {params.settings:q} --seed {params.seed}"
+        " {params.compute} --processes {resources.processes}"
         " --out {output:q}"

@@ -15,19 +15,21 @@ rule stage1:
     priority: 10
     conda:
         "../envs/dine.yaml"
-    threads: THREADS
+    threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS,
+        gpu=GPUS * PROCESSES,
+        processes=PROCESSES,
     params:
         backbone=backbone_settings,
         settings=section(CONFIG.stage1),
         seed=CONFIG.seed,
-        device=CONFIG.device,
+        compute=COMPUTE,
         code=code_digest("model", "training"),
     shell:
         "dine --log {log:q} --threads {threads} stage1 --pairs {input.pairs:q}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
-        " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/stage1'"
+        " {params.compute} --processes {resources.processes}"
+        " --name '{wildcards.dataset}/{wildcards.backbone}/stage1'"
         ' --out "$(dirname {output.model:q})"'
 
 
@@ -49,9 +51,9 @@ rule fields:
         gpu=GPUS,
     params:
         batch=CONFIG.evaluation.batch_size,
-        device=CONFIG.device,
+        compute=COMPUTE,
         code=code_digest("model"),
     shell:
         "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
-        " --pairs {input.pairs:q} --batch-size {params.batch} --device {params.device}"
+        " --pairs {input.pairs:q} --batch-size {params.batch} {params.compute}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/fields' --out {output:q}"

@@ -13,18 +13,20 @@ rule stage2_control:
         BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "lambda0.tsv"
     conda:
         "../envs/dine.yaml"
-    threads: THREADS
+    threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS,
+        gpu=GPUS * PROCESSES,
+        processes=PROCESSES,
     params:
         settings=section(CONFIG.stage2),
         seed=CONFIG.seed,
-        device=CONFIG.device,
+        compute=COMPUTE,
         code=code_digest("model", "training"),
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --settings {params.settings:q} --seed {params.seed}"
-        " --device {params.device} --name '{wildcards.dataset}/{wildcards.backbone}/lambda0'"
+        " {params.compute} --processes {resources.processes}"
+        " --name '{wildcards.dataset}/{wildcards.backbone}/lambda0'"
         ' --out "$(dirname {output.model:q})"'
 
 
@@ -42,18 +44,19 @@ rule stage2_prior:
         BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "{prior}.tsv"
     conda:
         "../envs/dine.yaml"
-    threads: THREADS
+    threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS,
+        gpu=GPUS * PROCESSES,
+        processes=PROCESSES,
     params:
         settings=section(CONFIG.stage2),
         seed=CONFIG.seed,
-        device=CONFIG.device,
+        compute=COMPUTE,
         code=code_digest("model", "priors", "training"),
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --variant {wildcards.prior} --prior {input.prior:q}"
         " --lambda {input.weight:q} --settings {params.settings:q} --seed {params.seed}"
-        " --device {params.device}"
+        " {params.compute} --processes {resources.processes}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior}'"
         ' --out "$(dirname {output.model:q})"'

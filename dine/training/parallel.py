@@ -1,0 +1,252 @@
+"""Who takes part in a training: one process, or several that share every batch."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import logging.handlers
+import multiprocessing
+import os
+import pickle
+import signal
+import socket
+import threading
+from collections.abc import Callable
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.multiprocessing import (
+    ProcessExitedException,
+    ProcessRaisedException,
+    start_processes,
+)
+
+from dine.errors import ConfigError, DineError
+from dine.training.state import Interrupted, StopRequest
+
+GRACE_SECONDS = 5.0
+"""How long the others may take to notice that one process has died, before they are ended."""
+
+
+def chosen_device(name: str) -> torch.device:
+    """``auto``, ``cpu`` or ``cuda`` as a device.
+
+    Raises:
+        DineError: ``cuda`` where there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise DineError("The device 'cuda' was asked for, but no CUDA device is available here.")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+class Alone:
+    """A training in this process; ``torch.distributed`` is not touched."""
+
+    rank, size, leads = 0, 1, True
+
+    def __init__(self, device: torch.device, stop: StopRequest):
+        self.device = device
+        self._stop = stop
+
+    @property
+    def stopping(self) -> bool:
+        """Whether to stop after this step."""
+        return self._stop.signal is not None
+
+    def share(self, module: nn.Module) -> nn.Module:
+        """The module in the form whose gradients are averaged over the processes."""
+        return module
+
+    def mean(self, values: Tensor) -> list[float]:
+        """Some numbers, averaged over the processes."""
+        return values.tolist()
+
+    def wait(self) -> None:
+        """Go on when every process has come here."""
+
+
+class Member:
+    """One of several processes, held together by Lightning Fabric.
+
+    The first one leads: it alone writes, validates and shows progress.
+    """
+
+    def __init__(self, count: int, device: torch.device, stop: Any):
+        from lightning_fabric import Fabric
+        from lightning_fabric.plugins.environments import LightningEnvironment
+
+        logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
+        self._fabric = Fabric(
+            accelerator=device.type,
+            devices=count,
+            strategy="ddp",
+            # Whatever cluster this runs on, our own parent has started us.
+            plugins=[LightningEnvironment()],
+        )
+        self._fabric.launch()
+        self.rank, self.size = self._fabric.global_rank, self._fabric.world_size
+        self.leads = self.rank == 0
+        self.device = self._fabric.device
+        self.stopping = False
+        self._stop = stop
+        self._parent = multiprocessing.parent_process()
+
+    def share(self, module: nn.Module) -> nn.Module:
+        return self._fabric.setup_module(module)
+
+    def mean(self, values: Tensor) -> list[float]:
+        # All must stop after the same step, so the wish to do so travels with the numbers.
+        wish = bool(self._stop.value) or not self._parent.is_alive()
+        values = torch.cat([values, values.new_tensor([wish])])
+        *values, wishes = self._fabric.all_reduce(values, reduce_op="mean").tolist()
+        self.stopping = wishes > 0
+        return values
+
+    def wait(self) -> None:
+        self._fabric.barrier()
+
+
+Team = Alone | Member
+
+
+def run_together(count: int, device: torch.device, work: Callable[[Team], Any]) -> None:
+    """Call ``work`` in ``count`` new processes, each with its own :class:`Member`.
+
+    SIGTERM and SIGINT to this process, and its death, make them all stop after the same step. When
+    one of them dies the others are ended.
+
+    Args:
+        count: number of processes; on CUDA each takes a device of its own.
+        device: its type is what counts.
+        work: can be pickled; its result is dropped, so it leaves what it makes in files.
+
+    Raises:
+        DineError: what ``work`` raised, or a process died.
+        ConfigError: more processes than CUDA devices, or Lightning Fabric is not installed.
+    """
+    if importlib.util.find_spec("lightning_fabric") is None:
+        raise ConfigError(
+            "More than one process needs Lightning Fabric: pip install lightning-fabric, or set "
+            "`processes` to 1."
+        )
+    if device.type == "cuda" and count > torch.cuda.device_count():
+        raise ConfigError(
+            f"`processes` is {count}, and each needs a device of its own, but the number of CUDA "
+            f"devices here is {torch.cuda.device_count()}."
+        )
+    context = multiprocessing.get_context("spawn")
+    stop = context.RawValue("b", 0)
+    reader, writer = context.Pipe(duplex=False)
+    arguments = (
+        count,
+        device,
+        _free_port(),
+        max(1, torch.get_num_threads() // count),
+        stop,
+        writer,
+        logging.getLogger().level,
+        # Not left to torch, which would have all processes train the same weights in one memory.
+        pickle.dumps(work),
+    )
+    died = None
+    errors: list[DineError] = []
+    listener = threading.Thread(target=_listen, args=(reader, errors))
+    with StopRequest() as request:
+        with _signals_held_back():
+            team = start_processes(_take_part, arguments, count, join=False, start_method="spawn")
+        writer.close()
+        listener.start()
+        try:
+            while not team.join(timeout=0.2, grace_period=GRACE_SECONDS):
+                stop.value = request.signal is not None
+        except ProcessExitedException as error:
+            how = error.signal_name or f"exit code {error.exit_code}"
+            died = DineError(
+                f"Process {error.error_index + 1} of {count} died ({how}); run the same command "
+                "again to go on from the last saved state."
+            )
+        except ProcessRaisedException as error:
+            died = error
+        finally:
+            for process in team.processes:  # none is left unless this process is interrupted
+                process.kill()
+                process.join()
+            listener.join()
+    # What we say ourselves explains more than how a process ended of it.
+    if errors or died:
+        raise errors[0] if errors else died
+
+
+@contextlib.contextmanager
+def _signals_held_back():
+    """Processes started here never see SIGTERM and SIGINT: only their parent tells them to stop.
+
+    Both often come to a whole group of processes, and would end those that are still starting.
+    """
+    # Were it to start with the first process, it would let the signals through again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM, signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _listen(reader: Connection, errors: list[DineError]) -> None:
+    """Log what the processes log and keep their errors, until the last of them has ended."""
+    with reader, contextlib.suppress(EOFError):
+        while True:
+            message = reader.recv()
+            if isinstance(message, DineError):
+                errors.append(message)
+            else:
+                logging.getLogger(message.name).handle(message)
+
+
+class _ToParent(logging.handlers.QueueHandler):
+    def enqueue(self, record: logging.LogRecord) -> None:
+        self.queue.send(record)
+
+
+def _take_part(
+    rank: int,
+    count: int,
+    device: torch.device,
+    port: int,
+    threads: int,
+    stop: Any,
+    writer: Connection,
+    level: int,
+    work: bytes,
+) -> None:
+    """What each process runs."""
+    os.environ |= {
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+        "LOCAL_RANK": str(rank),
+        "NODE_RANK": "0",
+        "OMP_NUM_THREADS": str(threads),  # else Fabric sets its own number
+    }
+    torch.set_num_threads(threads)
+    if rank == 0:
+        logging.getLogger().setLevel(level)
+        logging.getLogger().addHandler(_ToParent(writer))
+    try:
+        pickle.loads(work)(Member(count, device, stop))
+    except DineError as error:
+        with contextlib.suppress(OSError):  # the parent is dead
+            writer.send(error)
+        if not isinstance(error, Interrupted):  # which all agree on
+            raise

@@ -1,0 +1,133 @@
+"""Several processes train as one does, and stop together."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from test_training import IDENTITY, SETTINGS, Exploding, toy_pairs
+
+from dine.errors import ConfigError, DineError
+from dine.models.backbones import Backbone, Registration
+from dine.training import loop, parallel
+from dine.training.objective import DATA_TERMS, Objective
+from dine.training.state import Interrupted, one_writer
+
+ROUNDING = 1e-5
+"""Of what was learned: float32 gradients agree to some 1e-7, and Adam's steps are their ratios."""
+
+
+class Mover(Backbone):
+    """Small and smooth, so that rounding stays rounding: no choice of candidates can flip."""
+
+    def __init__(self):
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            self.layers = torch.nn.Sequential(
+                torch.nn.Linear(3, 8), torch.nn.Tanh(), torch.nn.Linear(8, 3)
+            )
+
+    def forward(self, batch):
+        return Registration(self.layers(batch.source), None, None)
+
+
+def run(folder, processes, *, steps=8, objective=None, on_step=None, batch_size=4):
+    changes = {"steps": steps, "batch_size": batch_size, "learning_rate": 1e-2}
+    backbone = Mover()
+    history = loop.train(
+        backbone,
+        objective or Objective(DATA_TERMS.get("chamfer")()),
+        toy_pairs(),
+        toy_pairs(3, seed=1),
+        SETTINGS.model_copy(update=changes),
+        seed=7,
+        folder=folder,
+        identity=IDENTITY,
+        name="toy",
+        device="cpu",
+        processes=processes,
+        on_step=on_step,
+    )
+    return backbone.state_dict(), history
+
+
+def difference(first, second):
+    return max((first[key] - second[key]).abs().max().item() for key in first)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("alone"), 1)
+
+
+def stop_at_four(step):
+    if step == 3:
+        raise Interrupted("enough")
+
+
+def test_two_processes_train_as_one_does(alone, tmp_path, caplog):
+    with caplog.at_level("INFO"):
+        weights, history = run(tmp_path, 2)
+    assert difference(weights, alone[0]) < ROUNDING * difference(Mover().state_dict(), alone[0])
+    for ours, theirs in zip(history, alone[1], strict=True):
+        assert ours.keys() == theirs.keys()
+        for key in ours.keys() - {"seconds"}:
+            assert ours[key] == pytest.approx(theirs[key], rel=1e-4), key
+    # What the leader logs comes out here, once.
+    assert caplog.text.count("starting from the beginning") == 1
+
+
+@pytest.mark.parametrize(("before", "after"), [(2, 1), (1, 2)])
+def test_another_number_of_processes_goes_on_from_the_state(alone, tmp_path, before, after):
+    with pytest.raises(DineError, match="enough"):
+        run(tmp_path, before, on_step=stop_at_four)
+    weights, history = run(tmp_path, after)
+    assert difference(weights, alone[0]) < ROUNDING * difference(Mover().state_dict(), alone[0])
+    assert [row["step"] for row in history] == list(range(1, 9))
+
+
+def test_errors_of_the_processes_are_the_users(tmp_path):
+    with pytest.raises(DineError, match="diverged at step 0"):
+        run(tmp_path, 2, objective=Objective(Exploding()))
+    with one_writer(tmp_path), pytest.raises(DineError, match=f"in use by process {os.getpid()}"):
+        run(tmp_path, 2)
+
+
+def test_a_batch_is_shared_equally(tmp_path):
+    with pytest.raises(ConfigError, match=r"`batch_size` is 3, which 2 processes cannot share"):
+        run(tmp_path, 2, batch_size=3)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_shares_make_up_the_batch(size):
+    class Team:
+        pass
+
+    parts = []
+    for rank in range(size):
+        team = Team()
+        team.rank, team.size = rank, size
+        parts.append(loop.share_of(team, step=5, batch_size=6, count=7, seed=3))
+    indices = np.concatenate([indices for indices, _ in parts])
+    assert indices.tolist() == loop.order_of(5, 6, 7, 3).tolist()
+    assert [key for _, keys in parts for key in keys] == [(3, 1, 5, p) for p in range(6)]
+
+
+def test_more_processes_than_devices(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(ConfigError, match="number of CUDA devices here is 1"):
+        parallel.run_together(2, torch.device("cuda"), print)
+
+
+def test_fabric_is_asked_for_by_name(monkeypatch):
+    monkeypatch.setattr(parallel.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="pip install lightning-fabric"):
+        parallel.run_together(2, torch.device("cpu"), print)
+
+
+def test_one_process_needs_none_of_it():
+    code = "import sys, dine.training.stages; sys.exit('lightning_fabric' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
