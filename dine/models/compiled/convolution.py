@@ -12,16 +12,17 @@ import torch
 from torch import Tensor
 
 from dine.geometry.neighbours import Neighbours
-from dine.models.compiled.parallel import jit, run
+from dine.models.compiled.parallel import jit, run, share
 from dine.models.compiled.rows import (
     Rows,
     Statistics,
-    _finish,
+    Tile,
     activate,
     activation_gradient,
-    add_sums,
     block_rows,
+    finish_sums,
     norm_gradient,
+    sums,
 )
 
 
@@ -81,24 +82,36 @@ def _maximum_gradient(
                     z[row - origin] = 0
 
 
+class _Buffers:
+    """Memory for a tile's rows (R, C), for each worker."""
+
+    def __init__(self, like: Tensor, tiles: list[Tile], channels: int):
+        self._like, self._rows, self._channels = like, max(map(len, tiles)), channels
+        self._kept: dict[int, Tensor] = {}
+
+    def get(self, worker: int, tile: Tile) -> Tensor:
+        if worker not in self._kept:
+            self._kept[worker] = self._like.new_empty(self._rows, self._channels)
+        return self._kept[worker][: len(tile)]
+
+
 class _Maximum:
     """max over groups of the norm of y Wᵀ: the norm keeps the order, so it comes last."""
 
     def __init__(self, rows: Rows, weight: Tensor, valid: np.ndarray):
         self.rows, self.weight, self.valid = rows, weight, valid
-        channels = len(weight)
-        self.statistics = Statistics(rows, channels, valid)
-        self.highest = weight.new_empty(rows.members * rows.groups, channels).numpy()
+        self.tiles = rows.tiles(len(weight))
+        self.statistics = Statistics(rows, len(weight), valid)
+        self.highest = weight.new_empty(rows.members * rows.groups, len(weight)).numpy()
         self.argmax = np.empty(self.highest.shape, np.int32)
 
-    def add(self, y: Tensor, buffer: Tensor, first: int, last: int) -> None:
-        """Take in the blocks first…last, whose rows are y (R, C)."""
-        rows = self.rows
-        z = torch.mm(y, self.weight.t(), out=buffer[: len(y)]).numpy()
-        origin = rows.first_row(first)
-        add_sums(z, self.statistics, origin, first, last)
-        place = (origin, rows.length, rows.step, rows.group)
-        run(_group_maximum, first, last, z, self.valid, *place, self.highest, self.argmax)
+    def add(self, y: Tensor, tile: Tile, buffer: Tensor) -> None:
+        """Take in a tile, whose rows are y (R, C)."""
+        rows, blocks = self.rows, (tile.first, tile.last)
+        z = torch.mm(y, self.weight.t(), out=buffer).numpy()
+        place = (tile.rows.start, rows.length, rows.step)
+        sums(z, self.valid, *place, *self.statistics.sums, *blocks)
+        _group_maximum(z, self.valid, *place, rows.group, self.highest, self.argmax, *blocks)
 
     def finish(self, eps: float) -> Tensor:
         """(B, G, C); zero at groups without a valid row."""
@@ -124,16 +137,13 @@ class _Maximum:
             (product / count).astype(dtype),
         ]
         self.grad = np.ascontiguousarray(grad.reshape(-1, grad.shape[-1]))
-        self.to_weight = torch.zeros_like(self.weight)
+        self._to_weight = self.weight.new_empty(len(self.tiles), *self.weight.shape)
 
-    def gradient(self, y: Tensor, buffer: Tensor, out: Tensor, first: int, last: int) -> None:
-        """Gradient of the rows y of some blocks into ``out``; adds to that of the weight."""
+    def gradient(self, y: Tensor, tile: Tile, buffer: Tensor, out: Tensor) -> None:
+        """Gradient of a tile's rows y into ``out``, and of the weight."""
         rows = self.rows
-        z = torch.mm(y, self.weight.t(), out=buffer[: len(y)])
-        run(
-            _maximum_gradient,
-            first,
-            last,
+        z = torch.mm(y, self.weight.t(), out=buffer)
+        _maximum_gradient(
             z.numpy(),
             self.valid,
             self.argmax,
@@ -141,13 +151,19 @@ class _Maximum:
             self.mean,
             self.scale,
             *self.means,
-            rows.first_row(first),
+            tile.rows.start,
             rows.length,
             rows.step,
             rows.group,
+            tile.first,
+            tile.last,
         )
-        self.to_weight.addmm_(z.t(), y)
+        torch.mm(z.t(), y, out=self._to_weight[tile.number])
         torch.mm(z, self.weight, out=out)
+
+    def weight_gradient(self) -> Tensor:
+        """The sum over tiles, in their order whoever worked on them."""
+        return self._to_weight.sum(dim=0)
 
 
 class LinearMaximum(torch.autograd.Function):
@@ -165,9 +181,11 @@ class LinearMaximum(torch.autograd.Function):
         rows = Rows(*y.shape[:2], group)
         maximum = _Maximum(rows, weight.detach(), rows.valid(mask))
         flat = y.view(-1, y.shape[2])
-        buffer = y.new_empty(rows.largest_tile(len(weight)), len(weight))
-        for first, last, part in rows.tiles(len(weight)):
-            maximum.add(flat[part], buffer, first, last)
+        buffers = _Buffers(y, maximum.tiles, len(weight))
+        share(
+            maximum.tiles,
+            lambda worker, tile: maximum.add(flat[tile.rows], tile, buffers.get(worker, tile)),
+        )
         out = maximum.finish(eps)
         ctx.save_for_backward(y)
         ctx.maximum = maximum
@@ -177,14 +195,17 @@ class LinearMaximum(torch.autograd.Function):
     def backward(ctx, grad: Tensor):
         (y,) = ctx.saved_tensors
         maximum = ctx.maximum
-        rows, width = maximum.rows, len(maximum.weight)
         maximum.begin_gradient(grad)
         flat = y.view(-1, y.shape[2])
         out = torch.empty_like(flat)
-        buffer = y.new_empty(rows.largest_tile(width), width)
-        for first, last, part in rows.tiles(width):
-            maximum.gradient(flat[part], buffer, out[part], first, last)
-        return out.view(y.shape), maximum.to_weight, None, None, None
+        buffers = _Buffers(y, maximum.tiles, len(maximum.weight))
+        share(
+            maximum.tiles,
+            lambda worker, tile: maximum.gradient(
+                flat[tile.rows], tile, buffers.get(worker, tile), out[tile.rows]
+            ),
+        )
+        return out.view(y.shape), maximum.weight_gradient(), None, None, None
 
 
 @jit
@@ -216,7 +237,7 @@ def _edge_sums(near, own, neighbour, valid, k, length, step, total, spread, coun
                         value = near[j, c] + base[c]
                         s[c] += value
                         q[c] += value * value
-        _finish(total, spread, count, block, shift, s, q, found)
+        finish_sums(total, spread, count, block, shift, s, q, found)
 
 
 @jit
@@ -358,62 +379,39 @@ class EdgeConvolution(torch.autograd.Function):
         points = [x.numpy().reshape(-1, channels) for x in (near, own)]
         dtype = points[0].dtype
         slope = dtype.type(slope)
-        place = (rows.length, rows.step)
-        statistics = Statistics(rows, channels, valid)
-        run(
-            _edge_sums,
-            0,
-            rows.blocks,
-            *points,
-            edges.neighbour,
-            valid,
-            rows.group,
-            *place,
-            statistics.total,
-            statistics.spread,
-            statistics.count,
-        )
-        first_norm = (statistics, *statistics.normalisation(eps, dtype))
-        statistics = Statistics(rows, channels, valid)
-        kept = near.new_empty(len(valid), channels)
-        buffer = near.new_empty(rows.largest_tile(channels), channels)
-        for first, last, part in rows.tiles(channels):
-            y = buffer[: part.stop - part.start]
-            run(
-                _edge_activate,
-                first,
-                last,
-                *points,
-                edges.neighbour,
-                valid,
-                *first_norm[1:],
-                slope,
-                rows.group,
-                part.start,
-                *place,
-                y.numpy(),
-            )
-            z = torch.mm(y, middle.t(), out=kept[part])
-            add_sums(z.numpy(), statistics, part.start, first, last)
-        second_norm = (statistics, *statistics.normalisation(eps, dtype))
+        size = (rows.length, rows.step)
         maximum = _Maximum(rows, last_weight, valid)
-        for first, last, part in rows.tiles(channels):
-            y = kept[part]
-            run(
-                activate,
-                first,
-                last,
-                y.numpy(),
-                valid,
-                *second_norm[1:],
-                slope,
-                part.start,
-                *place,
-            )
-            maximum.add(y, buffer, first, last)
+        buffers = _Buffers(near, maximum.tiles, channels)
+
+        first = Statistics(rows, channels, valid)
+        graph = (*points, edges.neighbour, valid)
+        run(_edge_sums, 0, rows.blocks, *graph, rows.group, *size, *first.sums)
+        first_norm = first.normalisation(eps, dtype)
+
+        second = Statistics(rows, channels, valid)
+        kept = near.new_empty(len(valid), channels)
+
+        def linear(worker: int, tile: Tile) -> None:
+            y = buffers.get(worker, tile)
+            blocks, place = (tile.first, tile.last), (tile.rows.start, *size)
+            norm = (*first_norm, slope)
+            _edge_activate(*graph, *norm, rows.group, *place, y.numpy(), *blocks)
+            z = torch.mm(y, middle.t(), out=kept[tile.rows]).numpy()
+            sums(z, valid, *place, *second.sums, *blocks)
+
+        share(maximum.tiles, linear)
+        second_norm = second.normalisation(eps, dtype)
+
+        def reduce(worker: int, tile: Tile) -> None:
+            y = kept[tile.rows]
+            blocks, place = (tile.first, tile.last), (tile.rows.start, *size)
+            activate(y.numpy(), valid, *second_norm, slope, *place, *blocks)
+            maximum.add(y, tile, buffers.get(worker, tile))
+
+        share(maximum.tiles, reduce)
         ctx.save_for_backward(near, own, middle, kept)
         ctx.edges, ctx.slope, ctx.maximum = edges, slope, maximum
-        ctx.first_norm, ctx.second_norm = first_norm, second_norm
+        ctx.first, ctx.second = (first, *first_norm), (second, *second_norm)
         return maximum.finish(eps)
 
     @staticmethod
@@ -423,82 +421,47 @@ class EdgeConvolution(torch.autograd.Function):
         rows, valid, channels = edges.rows, edges.valid, near.shape[2]
         points = [x.numpy().reshape(-1, channels) for x in (near, own)]
         dtype = points[0].dtype
-        place = (rows.length, rows.step)
-        sums = np.empty((2, rows.blocks, channels))
+        size = (rows.length, rows.step)
+        graph = (*points, edges.neighbour, valid)
+        block_sums = np.empty((2, rows.blocks, channels))
         out = torch.empty_like(kept)
-        size = rows.largest_tile(channels)
-        buffer, other = near.new_empty(2, size, channels)
+        buffers, others = (_Buffers(near, maximum.tiles, channels) for _ in range(2))
 
-        statistics, _, scale = ctx.second_norm
+        second, _, second_scale = ctx.second
         maximum.begin_gradient(grad)
-        for first, last, part in rows.tiles(channels):
-            y, g = kept[part], out[part]
-            maximum.gradient(y, buffer, g, first, last)
-            tile = (g.numpy(), y.numpy(), valid, slope, part.start, *place)
-            run(activation_gradient, first, last, *tile, *sums)
-        means = [x.astype(dtype) for x in statistics.means(*sums)]
 
-        to_middle = torch.zeros_like(middle)
-        statistics, *first_norm = ctx.first_norm
-        for first, last, part in rows.tiles(channels):
-            size = part.stop - part.start
-            g, y, z = out[part], buffer[:size], other[:size]
-            run(
-                norm_gradient,
-                first,
-                last,
-                g.numpy(),
-                kept[part].numpy(),
-                valid,
-                slope,
-                scale,
-                *means,
-                part.start,
-                *place,
-                z.numpy(),
-            )
-            run(
-                _edge_activate,
-                first,
-                last,
-                *points,
-                edges.neighbour,
-                valid,
-                *first_norm,
-                slope,
-                rows.group,
-                part.start,
-                *place,
-                y.numpy(),
-            )
-            to_middle.addmm_(z.t(), y)
+        def after_norm(worker: int, tile: Tile) -> None:
+            y, g = kept[tile.rows], out[tile.rows]
+            maximum.gradient(y, tile, buffers.get(worker, tile), g)
+            place = (tile.rows.start, *size)
+            blocks = (tile.first, tile.last)
+            activation_gradient(g.numpy(), y.numpy(), valid, slope, *place, *block_sums, *blocks)
+
+        share(maximum.tiles, after_norm)
+        means = [x.astype(dtype) for x in second.means(*block_sums)]
+
+        first, *first_norm = ctx.first
+        to_middle = middle.new_empty(len(maximum.tiles), *middle.shape)
+
+        def after_edges(worker: int, tile: Tile) -> None:
+            g, y, z = out[tile.rows], buffers.get(worker, tile), others.get(worker, tile)
+            blocks, place = (tile.first, tile.last), (tile.rows.start, *size)
+            values = (g.numpy(), kept[tile.rows].numpy(), valid, slope, second_scale)
+            norm_gradient(*values, *means, *place, z.numpy(), *blocks)
+            norm = (*first_norm, slope)
+            _edge_activate(*graph, *norm, rows.group, *place, y.numpy(), *blocks)
+            torch.mm(z.t(), y, out=to_middle[tile.number])
             torch.mm(z, middle, out=g)
-            tile = (g.numpy(), y.numpy(), valid, slope, part.start, *place)
-            run(activation_gradient, first, last, *tile, *sums)
-        means = [x.astype(dtype) for x in statistics.means(*sums)]
+            activation_gradient(g.numpy(), y.numpy(), valid, slope, *place, *block_sums, *blocks)
+
+        share(maximum.tiles, after_edges)
+        means = [x.astype(dtype) for x in first.means(*block_sums)]
 
         to_near, to_own = torch.empty_like(near), torch.empty_like(own)
-        run(
-            _edge_gradient,
-            0,
-            rows.blocks,
-            out.numpy(),
-            *points,
-            edges.neighbour,
-            valid,
-            *first_norm,
-            *means,
-            rows.group,
-            *place,
-            to_own.numpy().reshape(-1, channels),
-        )
-        run(
-            _add_edges,
-            0,
-            len(edges.start) - 1,
-            out.numpy(),
-            edges.order,
-            edges.start,
-            to_near.numpy().reshape(-1, channels),
-        )
-        return to_near, to_own, to_middle, maximum.to_weight, None, None, None
+        flat = (to_near.numpy().reshape(-1, channels), to_own.numpy().reshape(-1, channels))
+        norm = (*first_norm, *means)
+        grad = out.numpy()
+        run(_edge_gradient, 0, rows.blocks, grad, *graph, *norm, rows.group, *size, flat[1])
+        run(_add_edges, 0, len(flat[0]), grad, edges.order, edges.start, flat[0])
+        weights = (to_middle.sum(dim=0), maximum.weight_gradient())
+        return to_near, to_own, *weights, None, None, None

@@ -9,7 +9,6 @@ a tile consists of blocks, each of one member, whose sums are added up in a fixe
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +19,19 @@ from dine.models.compiled.parallel import jit, run
 
 _BLOCK_ROWS = 256
 _TILE_ENTRIES = 2**17
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Some consecutive blocks: number of the tile, first and last block, rows among the B·L."""
+
+    number: int
+    first: int
+    last: int
+    rows: slice
+
+    def __len__(self) -> int:
+        return self.rows.stop - self.rows.start
 
 
 @dataclass(frozen=True)
@@ -56,16 +68,15 @@ class Rows:
         member, inner = divmod(block, self.per_member)
         return member * self.length + min(inner * self.step, self.length)
 
-    def tiles(self, channels: int) -> Iterator[tuple[int, int, slice]]:
-        """First and last block of every tile, and its rows among the B·L."""
+    def tiles(self, channels: int) -> list[Tile]:
+        """The blocks in tiles that suit a core's cache."""
         blocks = max(1, _TILE_ENTRIES // (self.step * channels))
-        for first in range(0, self.blocks, blocks):
+        tiles = []
+        for number, first in enumerate(range(0, self.blocks, blocks)):
             last = min(first + blocks, self.blocks)
-            yield first, last, slice(self.first_row(first), self.first_row(last))
-
-    def largest_tile(self, channels: int) -> int:
-        """Rows of the largest tile."""
-        return max(rows.stop - rows.start for _, _, rows in self.tiles(channels))
+            rows = slice(self.first_row(first), self.first_row(last))
+            tiles.append(Tile(number, first, last, rows))
+        return tiles
 
     def valid(self, mask: Tensor | None) -> np.ndarray:
         """A mask of B·L rows, in the order of the rows."""
@@ -96,6 +107,11 @@ class Statistics:
         self.count = np.empty(rows.blocks)
         self.valid = valid
 
+    @property
+    def sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where kernels put the sums of their blocks."""
+        return self.total, self.spread, self.count
+
     def normalisation(self, eps: float, dtype: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Mean and 1/√(biased variance + eps): both (B, C)."""
         shape = (self.rows.members, self.rows.per_member, -1)
@@ -114,7 +130,7 @@ class Statistics:
 
 
 @jit
-def _finish(total, spread, count, block, shift, s, q, found):
+def finish_sums(total, spread, count, block, shift, s, q, found):
     count[block] = found
     for c in range(len(s)):
         mean = s[c] / max(found, 1)
@@ -123,7 +139,7 @@ def _finish(total, spread, count, block, shift, s, q, found):
 
 
 @jit
-def _sums(x, valid, origin, length, step, total, spread, count, first, last):
+def sums(x, valid, origin, length, step, total, spread, count, first, last):
     """Sums over blocks of x, whose row 0 is row ``origin``."""
     channels = x.shape[1]
     s = np.empty(channels, x.dtype)
@@ -144,14 +160,7 @@ def _sums(x, valid, origin, length, step, total, spread, count, first, last):
                     value = x[row - origin, c] - shift[c]
                     s[c] += value
                     q[c] += value * value
-        _finish(total, spread, count, block, shift, s, q, found)
-
-
-def add_sums(x: np.ndarray, statistics: Statistics, origin: int, first: int, last: int) -> None:
-    """Put the sums of some blocks of rows into the statistics."""
-    rows = statistics.rows
-    out = (statistics.total, statistics.spread, statistics.count)
-    run(_sums, first, last, x, statistics.valid, origin, rows.length, rows.step, *out)
+        finish_sums(total, spread, count, block, shift, s, q, found)
 
 
 @jit
@@ -227,11 +236,12 @@ class NormLeakyReLU(torch.autograd.Function):
         rows = Rows(*x.shape[:2])
         values = y.numpy().reshape(-1, x.shape[2])
         statistics = Statistics(rows, x.shape[2], rows.valid(mask))
-        add_sums(values, statistics, 0, 0, rows.blocks)
+        place = (0, rows.length, rows.step)
+        run(sums, 0, rows.blocks, values, statistics.valid, *place, *statistics.sums)
         mean, scale = statistics.normalisation(eps, values.dtype)
         slope = values.dtype.type(slope)
         valid = statistics.valid
-        run(activate, 0, rows.blocks, values, valid, mean, scale, slope, 0, rows.length, rows.step)
+        run(activate, 0, rows.blocks, values, valid, mean, scale, slope, *place)
         ctx.save_for_backward(y)
         ctx.slope, ctx.scale, ctx.statistics = slope, scale, statistics
         return y
