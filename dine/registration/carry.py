@@ -1,0 +1,174 @@
+"""Carry a field known at some points of an object to any other point of or near it.
+
+What is carried is a sum of three parts, each of which takes what the one before leaves over:
+
+1. the rigid motion of all samples (displacements only), which may safely be followed anywhere;
+2. a linear part along those principal axes of the samples that are at least ``_WIDE`` as wide as
+   the widest. Across a thin patch it cannot be told from the patch's bending, and following it
+   there would throw points beside the patch far off;
+3. the biharmonic spline of three dimensions (radial kernel r) through the rest.
+
+This was chosen on 1024 samples. Mean errors, in object radii, of fields of
+``dine.data.deformation`` at level 0.5 with noise of 0.03 a coordinate: at the vertices of ten
+closed shapes, half way from these to the middle and at 1.3 times their distance from it, and 0.5
+below six tissue patches:
+
+    =========================================  =======  ========  =======  ===========
+    interpolation                              surface  half way  outside  below patch
+    =========================================  =======  ========  =======  ===========
+    this sum                                   0.031    0.020     0.044    0.083
+    kernel r, linear polynomial                0.031    0.020     0.042    0.123
+    thin-plate spline                          0.046    0.058     0.094    0.290
+    thin-plate spline, smoothing 0.01          0.022    0.022     0.045    0.114
+    thin-plate spline, nearest 50 samples      0.047    > 1e11    > 1e11   2.2
+    =========================================  =======  ========  =======  ===========
+
+Bending and stretching gave the same picture. On a fifth of the points, held out of fields that the
+pretrained networks predicted for test pairs, it is 0.0402 (Robust-DefReg) and 0.0502 (DefTransNet)
+from the truth, the plain thin-plate spline 0.0418 and 0.0521, the best smoothed one 0.0393 and
+0.0495, the predictions themselves 0.0414 and 0.0508. So smoothing would gain 1 to 2 % at most, and
+is left out: samples keep the values that they were given.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from dine.errors import DataError
+
+# Beyond this many radii from the middle of the samples only the rigid motion still changes.
+_REACH = 2.0
+# Least width of a principal axis, as a share of the widest, that a linear part is fitted along.
+_WIDE = 0.2
+# Samples that are solved for at once: a dense system of 128 MiB.
+_MOST_SITES = 4096
+# Keeps samples that nearly coincide solvable.
+_SMOOTHING = 1e-9
+# Weight of "not turned" against all samples, which settles what too few of them leave open.
+_UNTURNED = 1e-7
+
+
+def carry(points: np.ndarray, field: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Interpolate a field from n samples to any other points.
+
+    A field of three columns is a displacement in the units of ``points``. Constant and rigid fields
+    are carried exactly (to 1e-6) everywhere, affine ones within two radii (the largest distance of
+    a sample from the mean of all) unless the samples are nearly flat. Farther out it is the rigid
+    motion plus what the rest amounts to at two radii.
+
+    Any other number of columns is read as so many values, such as an uncertainty, each in units of
+    its own. They stay between the least and the largest sample everywhere.
+
+    Samples get back their own values, up to 4096 of them; of more, neighbours are averaged until
+    4096 remain. Any number from one up will do, and they may coincide (the mean of their values is
+    used) or lie in a plane or on a line (what they leave open is taken as not turned and not
+    stretched). Memory grows by little more than the result; 500,000 queries of 1024 samples take
+    about 6 s.
+
+    Args:
+        points: (n, 3) samples, n >= 1.
+        field: (n, d) displacement (d = 3) or values at the samples, d >= 1.
+        queries: (m, 3) where to evaluate, in the frame and units of ``points``; m may be 0.
+
+    Returns:
+        (m, d) float64, finite, in the units of ``field``.
+
+    Raises:
+        DataError: another shape, or numbers that are NaN or infinite.
+    """
+    points = _finite("points", points, 3)
+    field = _finite("field", field, None)
+    queries = _finite("queries", queries, 3)
+    if len(points) == 0 or len(points) != len(field):
+        raise DataError(
+            f"A field of {len(field)} rows at {len(points)} points cannot be carried elsewhere; "
+            "expected one row a point, and at least one."
+        )
+    centre = points.mean(axis=0)
+    radius = np.linalg.norm(points - centre, axis=1).max() or 1.0
+    sites, places = (points - centre) / radius, (queries - centre) / radius
+    if field.shape[1] == 3:
+        return _displacement(*_thinned(sites, field / radius), places) * radius
+    return np.clip(
+        _spline(*_thinned(sites, field), _within_reach(places)),
+        field.min(axis=0),
+        field.max(axis=0),
+    )
+
+
+def _finite(name: str, array: np.ndarray, columns: int | None) -> np.ndarray:
+    array = np.asarray(array, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != (columns or max(1, array.shape[1])):
+        raise DataError(
+            f"The {name} to carry a field have the shape {array.shape}; expected (rows, "
+            f"{columns or 'at least 1'})."
+        )
+    if not np.isfinite(array).all():
+        raise DataError(f"The {name} to carry a field hold NaN or infinite numbers.")
+    return array
+
+
+def _thinned(sites: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distinct sites, at most ``_MOST_SITES``: means over groups, of places and of values."""
+    same = np.lexsort(sites.T)
+    new = (np.diff(sites[same], axis=0) != 0).any(axis=1)
+    sites, values = _group_means(sites, values, same, np.flatnonzero(np.append(True, new)))
+    if len(sites) > _MOST_SITES:
+        near = cKDTree(sites).indices  # neighbours in space follow each other
+        first = np.arange(_MOST_SITES) * len(sites) // _MOST_SITES
+        sites, values = _group_means(sites, values, near, first)
+    return sites, values
+
+
+def _group_means(
+    sites: np.ndarray, values: np.ndarray, order: np.ndarray, first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means over the runs of rows, taken in ``order``, that begin at the positions ``first``."""
+    count = np.diff(first, append=len(order))[:, None]
+    return tuple(np.add.reduceat(array[order], first) / count for array in (sites, values))
+
+
+def _displacement(sites: np.ndarray, field: np.ndarray, places: np.ndarray) -> np.ndarray:
+    middle, shift = sites.mean(axis=0), field.mean(axis=0)
+    turn = _rotation(sites - middle, sites - middle + field - shift).as_matrix().T - np.eye(3)
+
+    def rigid(x: np.ndarray) -> np.ndarray:
+        return (x - middle) @ turn + shift
+
+    near = _within_reach(places)
+    rest = field - rigid(sites)
+    gradient = _gradient(sites - middle, rest)
+    rest -= (sites - middle) @ gradient
+    return rigid(places) + (near - middle) @ gradient + _spline(sites, rest, near)
+
+
+def _rotation(before: np.ndarray, after: np.ndarray) -> Rotation:
+    """The rotation about the origin that fits best; of equally good ones, the smallest."""
+    axes = np.eye(3)
+    weights = np.concatenate([np.ones(len(before)), np.full(3, _UNTURNED * len(before))])
+    return Rotation.align_vectors(
+        np.concatenate([after, axes]), np.concatenate([before, axes]), weights
+    )[0]
+
+
+def _gradient(sites: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(3, d) slopes of a least-squares linear fit along the wide principal axes of the sites."""
+    scores, widths, axes = np.linalg.svd(sites, full_matrices=False)
+    wide = widths > _WIDE * widths[0]
+    return axes[wide].T @ (scores[:, wide].T @ values / widths[wide, None])
+
+
+def _spline(sites: np.ndarray, values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    if len(places) == 0:
+        return np.empty((0, values.shape[1]))
+    spline = RBFInterpolator(sites, values, kernel="linear", degree=0, smoothing=_SMOOTHING)
+    return spline(places)
+
+
+def _within_reach(places: np.ndarray) -> np.ndarray:
+    """Places farther out than ``_REACH`` drawn straight towards the middle."""
+    distance = np.linalg.norm(places, axis=1, keepdims=True)
+    return places * (_REACH / np.maximum(distance, _REACH))

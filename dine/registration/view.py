@@ -1,0 +1,203 @@
+"""One HTML file that shows a registration in three dimensions, in any browser, without a network.
+
+It holds its data as base64 and three.js as text (``three.min.js``; see ``three.entry.js`` for how
+that was made). A content security policy in the page forbids it to load anything.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from collections.abc import Callable, Mapping
+from importlib import resources
+from typing import Any
+
+import jinja2
+import matplotlib
+import numpy as np
+from markupsafe import Markup
+
+from dine.data.surface import Surface
+from dine.errors import DataError
+from dine.files import write_text
+from dine.registration.write import check_output
+
+#: Suffixes that ``write_view`` writes.
+VIEW_SUFFIXES: tuple[str, ...] = (".html", ".htm")
+
+_COLORMAP = "viridis"
+# Values above this share of all are drawn in the last colour if they would stretch the scale.
+_SHOWN = 0.99
+_STRETCH = 1.5
+
+
+def write_view(
+    path: str | os.PathLike,
+    source: Surface,
+    target: Surface,
+    result: np.ndarray,
+    *,
+    scalars: Mapping[str, np.ndarray] | None = None,
+    units: Mapping[str, str] | None = None,
+    title: str,
+    facts: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write a page to turn, overlay, colour and animate source, target and moved source.
+
+    Shapes with faces are drawn as surfaces, clouds as points. Coordinates keep float32 precision
+    about the middle of all shapes. Two meshes of 20,000 vertices and three scalars take 2.5 MB;
+    0.6 MB of it is the viewer, the rest grows with their number.
+
+    Args:
+        path: the .html file.
+        source: the unmoved source, V vertices.
+        target: what it was registered to, in the same frame and units.
+        result: (V, 3) moved source vertices, in their order.
+        scalars: (V,) numbers on the source vertices by displayed name, such as "distance to
+            target"; NaN where there is none. The first one is shown at first.
+        units: displayed unit by name of a scalar.
+        title: heading of the page, in plain text.
+        facts: displayed values by name, in plain text.
+        overwrite: replace a file that is there already.
+
+    Raises:
+        DataError: another suffix, or arrays that do not fit the source.
+        StorageError: a file is there already, the disk is full or the folder cannot be written.
+    """
+    check_output(path, VIEW_SUFFIXES, overwrite=overwrite)
+    result = Surface(result, name="The result").vertices
+    if result.shape != source.vertices.shape:
+        raise DataError(
+            f"A result of {len(result)} points does not fit a source of {len(source.vertices)}; "
+            "expected one row a vertex, in the same order."
+        )
+    layers = [
+        _layer("moved", "Moved source", source, "#3f7fc4", opacity=100, shown=True),
+        _layer("target", "Target", target, "#8794a3", opacity=35, shown=True),
+        _layer("source", "Source", source, "#d08a3c", opacity=45, shown=False),
+    ]
+    shown = [
+        _scalar(name, values, len(result), (units or {}).get(name, ""))
+        for name, values in (scalars or {}).items()
+    ]
+    every = np.concatenate([source.vertices, target.vertices, result])
+    centre = (every.min(axis=0) + every.max(axis=0)) / 2
+    radius = float(np.linalg.norm(every - centre, axis=1).max()) or 1.0
+
+    def normalised(vertices: np.ndarray) -> np.ndarray:
+        return (vertices - centre) / radius
+
+    data = {
+        "centre": centre.tolist(),
+        "radius": radius,
+        "source": _shape(source, normalised),
+        "target": _shape(target, normalised),
+        "result": _array(normalised(result), "float32"),
+        "scalars": shown,
+        "layers": layers,
+        "colormap": _colors(),
+        "view": _viewpoint(target.vertices),
+    }
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("dine.registration", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("view.html").render(
+        title=title,
+        facts={name: str(value) for name, value in (facts or {}).items()},
+        layers=layers,
+        names=[scalar["name"] for scalar in shown],
+        data=_embedded(data),
+        licence=Markup(_resource("three.LICENSE.txt")),
+        library=Markup(_resource("three.min.js")),
+        program=Markup(_resource("view.js")),
+    )
+    write_text(path, page)
+
+
+def _layer(
+    key: str, name: str, surface: Surface, color: str, *, opacity: int, shown: bool
+) -> dict[str, Any]:
+    size = f"{len(surface.vertices):,} {'points' if surface.faces is None else 'vertices'}"
+    return {
+        "id": key,
+        "name": name,
+        "size": size,
+        "color": color,
+        "opacity": opacity,
+        "shown": shown,
+    }
+
+
+def _scalar(name: str, values: np.ndarray, count: int, unit: str) -> dict[str, Any]:
+    """A scalar with the range of its colour bar and how many values it leaves out."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.shape != (count,):
+        raise DataError(
+            f"The scalar {name!r} has the shape {values.shape}; expected one number for each of "
+            f"{count} source vertices."
+        )
+    known = values[np.isfinite(values)]
+    low, high, over = 0.0, 1.0, 0
+    if known.size:
+        low, high = float(known.min()), float(known.max())
+        usual = float(np.quantile(known, _SHOWN))
+        if high - low > _STRETCH * (usual - low) > 0:
+            high, over = usual, int((known > usual).sum())
+        if 0 < low < high / 2 or low == high > 0:  # lengths and errors read best from zero
+            low = 0.0
+        if low == high:
+            high = low + 1.0
+    return {
+        "name": name,
+        "unit": unit,
+        "low": low,
+        "high": high,
+        "over": over,
+        "missing": int(count - known.size),
+        "values": _array(np.where(np.isfinite(values), values, np.nan), "float32"),
+    }
+
+
+def _shape(surface: Surface, normalised: Callable[[np.ndarray], np.ndarray]) -> dict[str, Any]:
+    faces = surface.faces
+    small = len(surface.vertices) <= 1 << 16
+    return {
+        "positions": _array(normalised(surface.vertices), "float32"),
+        "faces": None if faces is None else _array(faces, "uint16" if small else "uint32"),
+        "pointSize": float(np.clip(0.9 / np.sqrt(len(surface.vertices)), 0.004, 0.03)),
+    }
+
+
+def _array(array: np.ndarray, kind: str) -> dict[str, str]:
+    stored = np.ascontiguousarray(array).astype(np.dtype(kind).newbyteorder("<"))
+    return {"type": kind, "base64": base64.b64encode(stored.tobytes()).decode("ascii")}
+
+
+def _colors() -> list[str]:
+    colors = matplotlib.colormaps[_COLORMAP](np.linspace(0, 1, 64))
+    return [matplotlib.colors.to_hex(color) for color in colors]
+
+
+def _viewpoint(vertices: np.ndarray) -> dict[str, list[float]]:
+    """From the side on which the shape is broadest, a little from above and from one side."""
+    spread = np.ptp(vertices, axis=0)
+    thin = int(spread.argmin())
+    up = 1 if thin == 2 else 2  # images have y upwards, bodies and rooms z
+    direction = np.full(3, 0.25)
+    direction[thin] = 1.0
+    return {"direction": direction.tolist(), "up": np.eye(3)[up].tolist()}
+
+
+def _embedded(data: dict[str, Any]) -> Markup:
+    """JSON that cannot end the script element that holds it."""
+    return Markup(json.dumps(data, allow_nan=False).replace("<", "\\u003c"))
+
+
+def _resource(name: str) -> str:
+    return (resources.files("dine.registration") / name).read_text(encoding="utf-8")

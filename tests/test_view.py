@@ -1,0 +1,220 @@
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from dine.data.surface import Surface
+from dine.data.synthetic import primitive
+from dine.errors import DataError, StorageError
+from dine.registration.view import write_view
+
+SOURCE = primitive(0, 0)
+COUNT = len(SOURCE.vertices)
+MOVE = np.random.default_rng(0).normal(size=(COUNT, 3)) * 0.02
+RESULT = SOURCE.vertices + MOVE
+TARGET = Surface(RESULT[::2])
+SCALARS = {"displacement": np.linalg.norm(MOVE, axis=1), "distance": np.linspace(0.5, 4, COUNT)}
+
+
+class Page(HTMLParser):
+    """Texts by element, scripts, and every attribute that could load something."""
+
+    VOID = ("meta", "input", "br", "link")
+
+    def __init__(self, text):
+        super().__init__()
+        self.texts, self.addresses, self.ids, self.policy, self._open = [], [], {}, "", []
+        self.feed(text)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.addresses += [attrs[name] for name in ("src", "href", "action") if name in attrs]
+        if attrs.get("http-equiv") == "Content-Security-Policy":
+            self.policy = attrs["content"]
+        if "id" in attrs:
+            self.ids[attrs["id"]] = attrs
+        if tag not in self.VOID:
+            self._open.append((tag, attrs.get("id")))
+
+    def handle_endtag(self, tag):
+        assert self._open.pop()[0] == tag
+
+    def handle_data(self, data):
+        if self._open and data.strip():
+            self.texts.append((*self._open[-1], data))
+
+    def of(self, tag):
+        return [text.strip() for name, _, text in self.texts if name == tag]
+
+    def data(self):
+        return json.loads("".join(text for _, key, text in self.texts if key == "data"))
+
+
+def decode(entry):
+    return np.frombuffer(
+        base64.b64decode(entry["base64"]), np.dtype(entry["type"]).newbyteorder("<")
+    )
+
+
+def view(path, *, source=SOURCE, target=TARGET, result=RESULT, title="Title", **more):
+    write_view(path, source, target, result, title=title, **more)
+    return Page(path.read_text(encoding="utf-8"))
+
+
+def test_arrays_come_back(tmp_path):
+    data = view(tmp_path / "a.html", scalars=SCALARS, units={"displacement": "mm"}).data()
+
+    def places(entry):
+        return decode(entry).reshape(-1, 3) * data["radius"] + data["centre"]
+
+    np.testing.assert_allclose(places(data["source"]["positions"]), SOURCE.vertices, atol=1e-6)
+    np.testing.assert_allclose(places(data["result"]), RESULT, atol=1e-6)
+    np.testing.assert_allclose(places(data["target"]["positions"]), TARGET.vertices, atol=1e-6)
+    np.testing.assert_array_equal(decode(data["source"]["faces"]), SOURCE.faces.ravel())
+    assert data["target"]["faces"] is None
+    for entry, (name, values) in zip(data["scalars"], SCALARS.items(), strict=True):
+        assert entry["name"] == name
+        np.testing.assert_allclose(decode(entry["values"]), values, rtol=1e-6)
+    assert [entry["unit"] for entry in data["scalars"]] == ["mm", ""]
+
+
+def test_nothing_is_loaded_from_anywhere(tmp_path):
+    page = view(tmp_path / "a.html", scalars=SCALARS)
+    assert page.addresses == []
+    assert page.policy.startswith("default-src 'none';")
+    assert "http" not in page.policy
+    assert "url(" not in "".join(page.of("style"))
+    program = page.of("script")[-1]
+    assert not re.search(r"fetch|XMLHttpRequest|WebSocket|import\(|https?:", program)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
+
+
+def test_every_element_that_the_program_asks_for_exists(tmp_path):
+    page = view(tmp_path / "a.html", scalars=SCALARS)
+    program = page.of("script")[-1]
+    assert set(re.findall(r'get\("([\w-]+)"\)', program)) <= page.ids.keys()
+    for part in ("show", "opacity", "swatch"):
+        assert {f"{part}-{layer}" for layer in ("moved", "target", "source")} <= page.ids.keys()
+    assert "three.js authors" in page.of("script")[1]
+    # Whatever is used of three.js has been bundled.
+    entry = (resources.files("dine.registration") / "three.entry.js").read_text()
+    assert set(re.findall(r"THREE\.(\w+)", program)) <= set(re.findall(r"\w+", entry))
+
+
+def test_controls_can_be_reached_and_named(tmp_path):
+    page = view(tmp_path / "a.html", scalars=SCALARS, facts={"Seed": 0})
+    assert page.ids["stage"]["tabindex"] == "0"
+    assert "Arrow keys" in page.ids["stage"]["aria-label"]
+    assert page.of("option") == [*SCALARS, "one plain colour"]
+    for key in ("opacity-moved", "opacity-target", "opacity-source"):
+        assert "Opacity" in page.ids[key]["aria-label"]
+    assert page.of("dt") == ["Seed"]
+    assert page.of("dd") == ["0"]
+    assert "WebGL" in page.of("script")[-1]
+    assert any("JavaScript" in text for text in page.of("p"))
+
+
+HOSTILE = "</script><script>alert('x')</script><img src=x onerror=alert(1)>&amp;\u2028{{ 7 * 7 }}"
+
+
+def test_hostile_names_stay_text(tmp_path):
+    plain = view(tmp_path / "a.html", scalars={"a": SCALARS["distance"]}, facts={"b": "c"})
+    page = view(
+        tmp_path / "b.html",
+        title=HOSTILE,
+        scalars={HOSTILE: SCALARS["distance"]},
+        units={HOSTILE: HOSTILE},
+        facts={HOSTILE: HOSTILE},
+    )
+    assert len(page.of("script")) == len(plain.of("script"))
+    assert page.addresses == []
+    for tag in ("title", "h1", "dt", "dd"):
+        assert page.of(tag) == [HOSTILE]
+    assert page.data()["scalars"][0]["name"] == HOSTILE
+    assert page.data()["scalars"][0]["unit"] == HOSTILE
+
+
+def test_scales(tmp_path):
+    values = np.linspace(1, 5, COUNT)
+    scalars = {
+        "from zero": values,
+        "narrow": values + 100,
+        "signed": values - 3,
+        "constant": np.full(COUNT, 2.0),
+        "zero": np.zeros(COUNT),
+        "outlier": np.where(np.arange(COUNT) == 5, 1e6, values),
+        "gaps": np.where(np.arange(COUNT) < 7, np.nan, values),
+        "none": np.full(COUNT, np.nan),
+        "infinite": np.where(np.arange(COUNT) < 2, np.inf, values),
+    }
+    found = {
+        entry["name"]: entry
+        for entry in view(tmp_path / "a.html", scalars=scalars).data()["scalars"]
+    }
+    ranges = {name: (entry["low"], entry["high"]) for name, entry in found.items()}
+    assert ranges["from zero"] == (0, 5)
+    assert ranges["narrow"] == (101, 105)
+    assert ranges["signed"] == (-2, 2)
+    assert ranges["constant"] == (0, 2)
+    assert ranges["zero"] == ranges["none"] == (0, 1)
+    assert ranges["outlier"][1] < 5
+    assert found["outlier"]["over"] == pytest.approx(0.01 * COUNT, abs=1)
+    assert [found[name]["missing"] for name in ("gaps", "none", "infinite")] == [7, COUNT, 2]
+    assert np.isnan(decode(found["gaps"]["values"])[:7]).all()
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_units_do_not_matter(tmp_path, scale):
+    data = view(
+        tmp_path / "a.html",
+        source=Surface(SOURCE.vertices * scale + 5 * scale, SOURCE.faces),
+        target=Surface(TARGET.vertices * scale + 5 * scale),
+        result=RESULT * scale + 5 * scale,
+    ).data()
+    drawn = decode(data["result"])
+    assert 0.5 < np.abs(drawn).max() <= 1
+    restored = drawn.reshape(-1, 3) * data["radius"] + data["centre"]
+    np.testing.assert_allclose(restored / scale, RESULT + 5, atol=1e-5)
+
+
+def test_single_points_and_large_meshes(tmp_path):
+    point = Surface(np.ones((1, 3)))
+    data = view(tmp_path / "a.html", source=point, target=point, result=point.vertices).data()
+    assert data["radius"] == 1
+    vertices = np.random.default_rng(0).normal(size=(70_000, 3))
+    mesh = Surface(vertices, [[0, 1, 69_999]])
+    data = view(tmp_path / "b.html", source=mesh, target=mesh, result=vertices).data()
+    assert decode(data["target"]["faces"]).tolist() == [0, 1, 69_999]
+
+
+def test_size_of_the_file(tmp_path):
+    grid = np.stack(np.meshgrid(np.arange(142), np.arange(142), [0.0]), axis=-1).reshape(-1, 3)
+    corner = np.arange(141 * 142).reshape(141, 142)[:, :-1].ravel()
+    faces = np.concatenate([corner[:, None] + [0, 1, 142], corner[:, None] + [1, 143, 142]])
+    mesh = Surface(grid, faces)
+    scalars = dict.fromkeys("abc", grid[:, 0])
+    view(tmp_path / "a.html", source=mesh, target=mesh, result=grid + 1, scalars=scalars)
+    assert len(grid) > 20_000
+    assert (tmp_path / "a.html").stat().st_size < 2.7e6
+
+
+def test_what_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"does not fit a source"):
+        view(tmp_path / "a.html", result=RESULT[:-1])
+    with pytest.raises(DataError, match="NaN or infinite"):
+        view(tmp_path / "a.html", result=RESULT * np.nan)
+    with pytest.raises(DataError, match=r"'a' has the shape \(3,\)"):
+        view(tmp_path / "a.html", scalars={"a": np.zeros(3)})
+    with pytest.raises(DataError, match=r"suffix '\.pdf', which is not written; use one of \.html"):
+        view(tmp_path / "a.pdf")
+    assert list(tmp_path.iterdir()) == []
+    view(tmp_path / "a.html")
+    with pytest.raises(StorageError, match="exists already"):
+        view(tmp_path / "a.html")
+    view(tmp_path / "a.html", overwrite=True)
