@@ -5,7 +5,7 @@ PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
 
-.PHONY: run tiny test check format
+.PHONY: run tiny test check format docs wheel-check
 
 run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
@@ -31,6 +31,14 @@ format: .venv/installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/snakefmt Snakefile workflow/rules
+
+# The documentation site, in site/; a link that leads nowhere is an error.
+docs: .venv/installed
+	$(BIN)/properdocs build --quiet --strict --config-file mkdocs.yml
+
+# The package as a user installs it, in an environment of its own outside the checkout.
+wheel-check:
+	PYTHON=$(PYTHON) .ci/wheel
 
 .venv/installed: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=")'
