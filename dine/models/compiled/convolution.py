@@ -188,24 +188,44 @@ class LinearMaximum(torch.autograd.Function):
         )
         out = maximum.finish(eps)
         ctx.save_for_backward(y)
-        ctx.maximum = maximum
+        ctx.maximum, ctx.mask = maximum, mask
         return out
 
     @staticmethod
     def backward(ctx, grad: Tensor):
+        """Without the large tensor y Wᵀ: what the norm adds to its gradient is linear in y.
+
+        With n̂ the normalised values, the gradient before the norm is scale · (g − mean g −
+        n̂ · mean(g n̂)), where g is zero but at the maxima. So its sparse part takes a few rows of y
+        and W, and its dense part two small products of the Gram matrix yᵀy.
+        """
         (y,) = ctx.saved_tensors
         maximum = ctx.maximum
         maximum.begin_gradient(grad)
-        flat = y.view(-1, y.shape[2])
-        out = torch.empty_like(flat)
-        buffers = _Buffers(y, maximum.tiles, len(maximum.weight))
-        share(
-            maximum.tiles,
-            lambda worker, tile: maximum.gradient(
-                flat[tile.rows], tile, buffers.get(worker, tile), out[tile.rows]
-            ),
+        weight, group = maximum.weight, maximum.rows.group
+        mean, scale, mean_grad, mean_product = (
+            torch.from_numpy(x) for x in (maximum.mean, maximum.scale, *maximum.means)
         )
-        return out.view(y.shape), maximum.weight_gradient(), None, None, None
+        if ctx.mask is not None:
+            y = y * ctx.mask.unsqueeze(-1)
+        dense = scale.square() * mean_product
+        constant = dense * mean - scale * mean_grad
+        out = y @ -((weight.t() * dense.unsqueeze(1)) @ weight)
+        out += (constant @ weight).unsqueeze(1)
+        if ctx.mask is not None:
+            out *= ctx.mask.unsqueeze(-1)
+        to_weight = constant.t() @ y.sum(dim=1)
+        to_weight -= ((weight * dense.unsqueeze(-1)) @ (y.transpose(1, 2) @ y)).sum(dim=0)
+
+        sparse = torch.from_numpy(maximum.grad).view(grad.shape) * scale.unsqueeze(1)
+        member, place, channel = sparse.nonzero(as_tuple=True)
+        values = sparse[member, place, channel].unsqueeze(1)
+        argmax = torch.from_numpy(maximum.argmax).view(grad.shape)
+        row = place * group + argmax[member, place, channel]
+        # Adds in order, unlike index_put_ on several threads.
+        out.flatten(0, 1).index_add_(0, member * y.shape[1] + row, values * weight[channel])
+        to_weight.index_add_(0, channel, values * y[member, row])
+        return out, to_weight, None, None, None
 
 
 @jit
