@@ -17,6 +17,7 @@ include: "workflow/rules/stage2.smk"
 include: "workflow/rules/evaluate.smk"
 include: "workflow/rules/report.smk"
 include: "workflow/rules/pretraining.smk"
+include: "workflow/rules/registration.smk"
 
 
 rule all:

@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 from dine import __version__, config
-from dine.errors import ConfigError, DineError
+from dine.errors import ConfigError, DataError, DineError
 from dine.files import write_json, write_text
 
 # Heavy modules (torch, matplotlib) are imported by the command that needs them.
@@ -63,6 +63,9 @@ variants_option = click.option(
     "--variant", "variants", type=IN, multiple=True, help="Corrupted targets; repeatable."
 )
 pairs_option = click.option("--pairs", type=IN, required=True, help="Pairs (HDF5).")
+targets_option = click.option(
+    "--targets", type=IN, multiple=True, help="Of `resample`, one for each file of pairs."
+)
 model_option = click.option("--model", type=IN, required=True, help="Weights (safetensors).")
 
 
@@ -234,6 +237,18 @@ def corrupt(pairs: Path, condition: str, level: float, seed: int, out: Path):
 
 
 @cli.command()
+@click.option("--raw", "raw_file", type=IN, required=True, help="raw.json of `dine raw`.")
+@pairs_option
+@seed_option
+@click.option("--out", type=OUT, required=True, help="Targets to write (HDF5).")
+def resample(raw_file: Path, pairs: Path, seed: int, out: Path):
+    """Draw the points of all targets anew, as two scans of one object never share points."""
+    from dine.data.prepare import resample_targets
+
+    resample_targets(raw_file, pairs, seed=seed, out=out)
+
+
+@cli.command()
 @pairs_option
 @click.option("--out", type=OUT, required=True, help="Result (JSON).")
 @seed_option
@@ -286,12 +301,13 @@ def stage1(pairs, backbone, settings, seed, compute, name, out):
 
 @cli.command()
 @click.option("--pairs", type=IN, required=True, multiple=True, help="Pairs (HDF5); repeatable.")
+@targets_option
 @backbone_option
 @settings_option(config.Pretraining)
 @seed_option
 @training_options
 @click.option("--out", type=FOLDER, required=True, help="Run folder.")
-def pretrain(pairs, backbone, settings, seed, compute, out):
+def pretrain(pairs, targets, backbone, settings, seed, compute, out):
     """Train weights to start Stage 1 from, on synthetic pairs with known displacement."""
     from dine.training import stages
 
@@ -303,6 +319,7 @@ def pretrain(pairs, backbone, settings, seed, compute, out):
         settings,
         seed=seed,
         out=out,
+        targets=list(targets),
         compute=compute,
     )
 
@@ -310,22 +327,31 @@ def pretrain(pairs, backbone, settings, seed, compute, out):
 @cli.command()
 @model_option
 @pairs_option
+@click.option("--targets", type=IN, help="Of `resample`; seen instead of the pairs' own.")
 @batch_option
 @prediction_options
 @name_option
 @click.option("--out", type=OUT, required=True, help="Fields to write (HDF5).")
-def fields(model, pairs, batch_size, compute, name, out):
+def fields(model, pairs, targets, batch_size, compute, name, out):
     """Write a model's displacement fields of the training split."""
     from dine.training import stages
 
     _start_torch()
     stages.dump_fields(
-        model, pairs, out, name=name or "fields", batch_size=batch_size, compute=compute
+        model,
+        pairs,
+        out,
+        name=name or "fields",
+        batch_size=batch_size,
+        targets=targets,
+        compute=compute,
     )
 
 
 @cli.command("fit-prior")
-@click.option("--fields", type=IN, required=True, help="Fields of `dine fields` (HDF5).")
+@click.option(
+    "--fields", type=IN, multiple=True, required=True, help="Of `dine fields` (HDF5); repeatable."
+)
 @settings_option(config.PriorConfig)
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Prior to write (safetensors).")
@@ -337,7 +363,7 @@ def fit_prior(fields, settings, seed, out):
     from dine.training import stages
 
     _start_torch()
-    stages.fit_prior(fields, settings, seed=seed, out=out)
+    stages.fit_prior(list(fields), settings, seed=seed, out=out)
 
 
 prior_files_option = click.option(
@@ -491,6 +517,226 @@ def report(results, settings, out):
     from dine.reporting.build import build_report
 
     build_report(results, settings, out)
+
+
+# --- own scans ------------------------------------------------------------------------------------
+
+
+def model_options(command):
+    """Which weights to register with; given to the command as ``model``."""
+
+    @functools.wraps(command)
+    def run(backbone, weights, prior, calibration, device, precision, **values):
+        from dine.registration.register import load_model
+
+        def load():
+            model = load_model(backbone, weights=weights, prior=prior, calibration=calibration)
+            model.backbone.precision = precision
+            return model
+
+        return command(**values, load_model=load, device=device)
+
+    for option in (
+        click.option(
+            "--calibration", type=IN, help="Of other weights than the shipped ones; `calibrate`."
+        ),
+        click.option("--prior", type=IN, help="A fitted prior, for the trust score and --map."),
+        click.option("--weights", type=IN, help="Weights of ours or of the backbones' authors."),
+        click.option("--backbone", default="robust_defreg", help="Shipped weights to use."),
+        click.option("--precision", type=click.Choice(["float32", "bf16"]), default="float32"),
+        click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto"),
+    ):
+        run = option(run)
+    return run
+
+
+def registration_options(command):
+    for option in (
+        click.option("--view", is_flag=True, help="Also write a page to turn and overlay."),
+        click.option("--seed", type=click.IntRange(0), default=0, help="Of the drawn points."),
+        click.option(
+            "--points", type=click.IntRange(16), default=1024, help="Points that are looked at."
+        ),
+        click.option("--partial", is_flag=True, help="The target shows a part of the source only."),
+        click.option(
+            "--map",
+            "map_steps",
+            type=click.IntRange(1),
+            is_flag=False,
+            flag_value=60,
+            default=None,
+            help="Refine with the prior, in so many steps (60).",
+        ),
+        click.option(
+            "--prealign",
+            default="auto",
+            help="Rigid alignment first: auto, off, or a text file of a 4×4 matrix.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def _alignment(prealign: str):
+    if prealign in ("auto", "off"):
+        return prealign
+    import numpy as np
+
+    from dine.registration.frame import check_rigid
+
+    try:
+        return check_rigid(np.loadtxt(prealign), prealign)
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"--prealign {prealign} is neither auto nor off nor a readable text file of a 4×4 "
+            f"matrix ({error})."
+        ) from None
+
+
+@cli.command(
+    epilog="""
+    Examples:
+
+    \b
+    dine register before.ply after.ply -o moved.ply --view
+    dine register ct.stl us.obj -o moved.stl --apply tumour.stl --partial
+    """
+)
+@click.argument("source", type=IN)
+@click.argument("target", type=IN)
+@click.option("-o", "--out", type=OUT, required=True, help="The moved source; suffix says how.")
+@click.option("--apply", type=IN, multiple=True, help="Another shape to move along; repeatable.")
+@click.option(
+    "--landmarks", type=IN, nargs=2, help="Corresponding points of source and target, to measure."
+)
+@registration_options
+@click.option("--overwrite", is_flag=True, help="Replace files that are there already.")
+@model_options
+def register(
+    source,
+    target,
+    out,
+    apply,
+    landmarks,
+    prealign,
+    map_steps,
+    partial,
+    points,
+    seed,
+    view,
+    overwrite,
+    load_model,
+    device,
+):
+    """Move SOURCE onto TARGET: any mesh or point file, any number of points, any units.
+
+    Beside the moved source OUT go the displacement of every vertex (OUT.field.npz, OUT.field.vtp),
+    a report (OUT.json) and, with --view, a page to look at (OUT.html).
+    """
+    from dine.data.readers import read_surface
+    from dine.registration.output import Outputs, save
+    from dine.registration.register import register as run
+    from dine.registration.register import shapes_by_name
+
+    _start_torch()
+    shapes = shapes_by_name(apply)
+    outputs = Outputs(out)
+    outputs.check(shapes, view=view, overwrite=overwrite)
+    marks = [read_surface(path).vertices for path in landmarks] if landmarks else None
+    result = run(
+        source,
+        target,
+        model=load_model(),
+        prealign=_alignment(prealign),
+        apply=shapes,
+        landmarks=tuple(marks) if marks else None,
+        map_steps=map_steps or 0,
+        partial=partial,
+        points=points,
+        seed=seed,
+        device=device,
+    )
+    said = save(result, outputs, colors_from=source, applied=shapes, view=view, overwrite=overwrite)
+    report = result.report
+    click.echo(
+        f"{out}: HD95 {report['before']['hd95']:.4g} -> {report['after']['hd95']:.4g}, "
+        f"{result.trust.verdict}"
+        + (
+            f", expected error {result.trust.expected_error:.3g}"
+            if result.trust.expected_error is not None
+            else ""
+        )
+        + f" ({report['seconds']:.1f} s)"
+    )
+    for sentence in (*result.trust.reasons, *said):
+        click.echo(f"  {sentence}")
+
+
+@cli.command(
+    "register-many",
+    epilog="""
+    Examples:
+
+    \b
+    dine register-many pairs.csv -o results/scans
+    dine register-many scans/ -o results/scans --view
+    """,
+)
+@click.argument("manifest", type=click.Path(exists=False, path_type=Path))
+@click.option("-o", "--out", type=FOLDER, required=True, help="Folder of all results.")
+@click.option("--suffix", default="", help="Format of the moved sources, such as .ply.")
+@registration_options
+@model_options
+def register_many(
+    manifest, out, suffix, prealign, map_steps, partial, points, seed, view, load_model, device
+):
+    """Register every pair of MANIFEST, a CSV file (source, target, name) or a folder.
+
+    A pair that fails is reported and does not stop the others; run the same command again to go on
+    after an interruption. OUT/summary.csv has one row a pair.
+    """
+    from dine.registration.many import read_jobs
+    from dine.registration.many import register_many as run
+
+    _start_torch()
+    settings = {
+        "prealign": _alignment(prealign),
+        "map_steps": map_steps or 0,
+        "partial": partial,
+        "points": points,
+        "seed": seed,
+        "device": device,
+    }
+    summary = run(
+        read_jobs(manifest), out, load_model(), suffix=suffix, view=view, settings=settings
+    )
+    failed = int((summary["state"] == "failed").sum())
+    click.echo(f"{len(summary) - failed} of {len(summary)} registered; {out / 'summary.csv'}")
+    if failed:
+        sys.exit(1)
+
+
+@cli.command()
+@model_option
+@click.option("--pairs", type=IN, multiple=True, required=True, help="Pairs (HDF5); repeatable.")
+@targets_option
+@click.option("--prior", type=IN, help="The prior that the trust score is to use.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto")
+@click.option("--out", type=OUT, required=True, help="Calibration to write (JSON, and a plot).")
+def calibrate(model, pairs, targets, prior, device, out):
+    """Learn from validation pairs what a model's uncertainty means; check it on test pairs."""
+    from dine.registration.calibration import calibrate as run
+    from dine.training.parallel import chosen_device
+
+    _start_torch()
+    run(
+        model,
+        list(pairs),
+        out,
+        targets=list(targets),
+        prior=prior,
+        device=chosen_device(device),
+    )
 
 
 def main() -> None:

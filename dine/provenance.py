@@ -47,6 +47,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "training": ("training",),
     "evaluation": ("evaluation",),
     "reporting": ("reporting",),
+    "calibration": ("registration/calibration.py", "registration/quality.py"),
     "registration": ("registration",),
 }
 

@@ -19,7 +19,7 @@ from dine import cli, config
 from dine.data.batch import make_batch
 from dine.data.fields import read_fields
 from dine.data.obtain import obtain
-from dine.data.pairs import read_pairs, read_variant
+from dine.data.pairs import read_pairs, read_seen, read_variant, write_pairs
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.evaluation.metrics import chamfer
 from dine.files import read_json
@@ -373,3 +373,64 @@ def test_settings_from_a_file_and_bad_settings(chain, tmp_path):
         dine("stage1", "--pairs", chain / "pairs.h5", "--settings", '{"stps": 1}', "--out", out)
     with pytest.raises(ConfigError, match="neither JSON nor @FILE"):
         dine("stage1", "--pairs", chain / "pairs.h5", "--settings", "steps=1", "--out", out)
+
+
+@pytest.fixture(scope="module")
+def resampled(chain):
+    out = chain / "resampled.h5"
+    dine("resample", "--raw", chain / "raw.json", "--pairs", chain / "pairs.h5", "--out", out)
+    return out
+
+
+def test_resampled_targets_lie_on_the_target_but_share_no_point(chain, resampled):
+    pairs = read_pairs(chain / "pairs.h5")
+    found = read_variant(resampled, pairs)
+    assert found.condition == "resampled"
+    for row in range(len(pairs)):
+        table = np.linalg.norm(found.target[row][:, None] - pairs.target[row][None], axis=2)
+        assert table.min() > 1e-6
+        # Within the spacing of 64 points on the same surface.
+        assert np.median(table.min(axis=1)) < 0.3
+    again = chain / "again.h5"
+    dine("resample", "--raw", chain / "raw.json", "--pairs", chain / "pairs.h5", "--out", again)
+    assert again.read_bytes() == resampled.read_bytes()
+
+
+def test_pretraining_sees_both_kinds_of_targets(chain, resampled, tmp_path):
+    settings = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
+    both = tmp_path / "both"
+    pairs = ("--pairs", chain / "pairs.h5")
+    arguments = ("pretrain", *pairs, "--settings", settings)
+    dine(*arguments, "--targets", resampled, "--out", both)
+    dine(*arguments, "--out", tmp_path / "own")
+    record = read_json(both / "run.json")
+    own = read_json(tmp_path / "own" / "run.json")
+    assert record["train_pairs"] == 2 * own["train_pairs"]
+    assert record["inputs"]["targets"]
+    assert record["final"]["val_mce"] != own["final"]["val_mce"]
+    with pytest.raises(ConfigError, match="one for each"):
+        dine(*arguments, *pairs, "--targets", resampled, "--out", tmp_path / "x")
+
+
+def test_fields_of_resampled_targets_differ(chain, resampled, tmp_path):
+    model = ("--model", chain / "stage1" / "model.safetensors", "--pairs", chain / "pairs.h5")
+    dine("fields", *model, "--targets", resampled, "--out", tmp_path / "dvf.h5")
+    assert (read_fields(tmp_path / "dvf.h5") != read_fields(chain / "dvf.h5")).any()
+
+
+def test_a_prior_is_fitted_to_several_files_of_fields(chain, tmp_path):
+    fields = ("--fields", chain / "dvf.h5") * 2
+    settings = '{"kind": "pca", "arguments": {"components": 2}}'
+    dine("fit-prior", *fields, "--settings", settings, "--out", tmp_path / "p.safetensors")
+    one = load_prior(chain / "pca.safetensors")
+    two = load_prior(tmp_path / "p.safetensors")
+    assert two.notes["samples"] == 2 * one.notes["samples"]
+    assert (one.mean - two.mean).abs().max() < 1e-6
+
+
+def test_targets_of_other_pairs_are_refused(chain, resampled, tmp_path):
+    other = tmp_path / "other.h5"
+    pairs = read_pairs(chain / "pairs.h5").select("train")
+    write_pairs(other, pairs)
+    with pytest.raises(DataError, match="made from other pairs"):
+        read_seen([other], [resampled], "train")

@@ -61,6 +61,9 @@ FORMAT_VERSION = 1
 
 SPLITS = ("train", "val", "test")
 
+RESAMPLED = "resampled"
+"""Condition of targets whose points were drawn independently of the source's."""
+
 _TEXT = "text"
 _NORMALISED = "of the normalised frame"
 _FILE_UNITS = "of the source file"
@@ -238,9 +241,10 @@ class Variant:
     """Corrupted targets of some pairs, row by row; the clean ones stay in the ``PairSet``.
 
     Attributes:
-        condition: ``noise`` or ``outliers``.
+        condition: ``noise``, ``outliers`` or ``resampled``.
         level: standard deviation of the noise in the normalised frame, or percent of outliers.
-        target: (P, M, 3) float32, normalised frame; row i < N is still point i of the clean target.
+        target: (P, M, 3) float32, normalised frame; row i < N is still point i of the clean target,
+            except where they were ``resampled``.
         inlier: (P, M) bool, False at outliers.
         name: (P,) str, ids of the pairs.
 
@@ -332,6 +336,36 @@ def read_variant(path: str | os.PathLike, pairs: PairSet) -> Variant:
         )
     rows = [position[name] for name in pairs.name.tolist()]
     return Variant(condition, level, **{name: values[rows] for name, values in columns.items()})
+
+
+def read_seen(
+    pairs_paths: Sequence[Path], targets_paths: Sequence[Path] | None, split: str
+) -> tuple[PairSet, np.ndarray | None]:
+    """The pairs of a split of some files, and the targets (P, M, 3) that networks see instead.
+
+    Args:
+        pairs_paths: pair files.
+        targets_paths: variants of all pairs of each, or None for the pairs' own targets.
+        split: ``train``, ``val`` or ``test``.
+
+    Raises:
+        ConfigError: not one file of targets for each of pairs.
+        DataError: a file is missing, damaged, or made from other pairs.
+    """
+    if not targets_paths:
+        return PairSet.concatenate([read_pairs(path, split=split) for path in pairs_paths]), None
+    if len(targets_paths) != len(pairs_paths):
+        raise ConfigError(
+            f"There are {len(targets_paths)} files of targets for {len(pairs_paths)} of pairs; "
+            "expected one for each."
+        )
+    sets, targets = [], []
+    for pairs_path, targets_path in zip(pairs_paths, targets_paths, strict=True):
+        pairs = read_pairs(pairs_path)
+        rows = _rows_of(pairs.split, split)
+        targets.append(read_variant(targets_path, pairs).target[rows])
+        sets.append(pairs.select(index=rows))
+    return PairSet.concatenate(sets), np.concatenate(targets)
 
 
 def _rows_of(parts: np.ndarray, split: str) -> np.ndarray:

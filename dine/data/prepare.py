@@ -14,7 +14,17 @@ import numpy as np
 from dine.config import Pairs
 from dine.data.layout import Inventory, PairFiles, check_pair
 from dine.data.obtain import obtained
-from dine.data.pairs import PAIR_DATASETS, SPLITS, PairSet, keyed_rng, read_pairs, write_pairs
+from dine.data.pairs import (
+    PAIR_DATASETS,
+    RESAMPLED,
+    SPLITS,
+    PairSet,
+    Variant,
+    keyed_rng,
+    read_pairs,
+    write_pairs,
+    write_variant,
+)
 from dine.data.readers import read_surface
 from dine.data.sampling import (
     SurfaceSamples,
@@ -49,6 +59,35 @@ def prepare_pairs(raw: Path, settings: Pairs, *, seed: int, out: Path) -> None:
             progress=lambda done, total: bar.update(),
         )
     write_pairs(out, pairs)
+
+
+def resample_targets(raw: Path, pairs_path: Path, *, seed: int, out: Path) -> None:
+    """Write targets whose points were drawn anew: same surfaces, no point-to-point counterpart.
+
+    Two scans of one object never share points. The result is a variant of condition
+    ``resampled`` (level 1) of all pairs in the file; draws are keyed by seed and object.
+
+    Raises:
+        DataError: the pairs were not made from these raw files.
+    """
+    inventory, _ = obtained(raw)
+    pairs = read_pairs(pairs_path)
+    files = {_pair_name(pair): pair for pair in inventory.pairs if pair.condition == "deformation"}
+    missing = [name for name in pairs.name.tolist() if name not in files]
+    if missing:
+        raise DataError(f"{pairs_path} was not made from {raw}, which lacks {missing[0]!r}.")
+    targets = np.empty_like(pairs.target)
+    with Progress("resampled targets", len(pairs), unit="pair") as bar:
+        for row, name in enumerate(pairs.name.tolist()):
+            pair = files[name]
+            source, target = read_surface(pair.source), read_surface(pair.target)
+            check_pair(source, target, pair.name)
+            rng = keyed_rng(seed, "resampled", pair.object)
+            drawn = sample_surface(source, targets.shape[1], rng).carry(target.vertices)
+            targets[row] = (drawn - pairs.center[row]) / pairs.scale[row]
+            bar.update()
+    inlier = np.ones(targets.shape[:2], bool)
+    write_variant(out, Variant(RESAMPLED, 1.0, targets, inlier, pairs.name), pairs.checksum)
 
 
 def measure_agreement(path: Path, *, seed: int) -> dict[str, object]:
@@ -150,6 +189,10 @@ def make_pairs(
 _Row = dict[str, Any]
 
 
+def _pair_name(files: PairFiles) -> str:
+    return files.name if files.level is None else f"{files.level:g}/{files.name}"
+
+
 def _sample_all(
     inventory: Inventory, sampler: _Sampler, progress: Callable[[int, int], None] | None
 ) -> tuple[list[_Row], list[tuple[str, str]]]:
@@ -157,7 +200,7 @@ def _sample_all(
     every = [files for files in inventory.pairs if files.condition == "deformation"]
     rows, skipped, names = [], [], set()
     for done, files in enumerate(every, start=1):
-        name = files.name if files.level is None else f"{files.level:g}/{files.name}"
+        name = _pair_name(files)
         try:
             if name in names:
                 raise DataError(f"{files.target}: another pair is called {name} too; rename one.")

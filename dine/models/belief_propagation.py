@@ -179,3 +179,16 @@ def read_out(candidates: Candidates, belief: Tensor, temperature: float = 50.0) 
     """
     weights = torch.softmax(-temperature * belief, dim=-1)
     return torch.einsum("bnk,bnkd->bnd", weights, candidates.displacement)
+
+
+def marginal_variance(
+    candidates: Candidates, belief: Tensor, displacement: Tensor, temperature: float = 50.0
+) -> Tensor:
+    """Expected squared distance from the read-out to the candidates under the marginals: (B, N).
+
+    In squared units of the candidates, summed over coordinates: 0 where one candidate has all the
+    weight. It says how sure the network is, not how right; that takes a calibration.
+    """
+    weights = torch.softmax(-temperature * belief, dim=-1)
+    squares = (candidates.displacement - displacement.unsqueeze(2)).square().sum(-1)
+    return (weights * squares).sum(-1)

@@ -109,6 +109,8 @@ def train(
     folder: Path,
     identity: dict[str, str],
     name: str,
+    train_targets: np.ndarray | None = None,
+    val_targets: np.ndarray | None = None,
     device: str = "auto",
     processes: int = 1,
     on_step: Callable[[int], None] | None = None,
@@ -125,6 +127,8 @@ def train(
         folder: where state and running history are kept.
         identity: digests that a saved state must share to be used (settings, inputs, code).
         name: shown with the progress.
+        train_targets: (P, M, 3), stand in for the training pairs' own targets.
+        val_targets: likewise for the validation pairs.
         device: ``auto``, ``cpu`` or ``cuda``.
         processes: that share every batch; on CUDA each has a device of its own. Their number
             changes the result by rounding only, and is no part of the identity.
@@ -152,6 +156,8 @@ def train(
         objective=objective,
         train_pairs=train_pairs,
         val_pairs=val_pairs,
+        train_targets=train_targets,
+        val_targets=val_targets,
         settings=settings,
         seed=seed,
         folder=folder,
@@ -175,6 +181,8 @@ def _train(
     objective: Objective,
     train_pairs: PairSet,
     val_pairs: PairSet,
+    train_targets: np.ndarray | None,
+    val_targets: np.ndarray | None,
     settings: Training,
     seed: int,
     folder: Path,
@@ -192,8 +200,8 @@ def _train(
         weight_decay=settings.weight_decay,
         fused=True,
     )
-    batches = Batches(train_pairs, team.device)
-    val_batches = Batches(val_pairs, team.device)
+    batches = Batches(train_pairs, team.device, train_targets)
+    val_batches = Batches(val_pairs, team.device, val_targets)
     path = folder / STATE
     with one_writer(folder) if team.leads else contextlib.nullcontext():
         team.wait()  # until the folder is ours

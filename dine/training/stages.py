@@ -24,7 +24,7 @@ from dine.config import (
 )
 from dine.data.fields import FIELDS_FORMAT, put_fields, read_fields
 from dine.data.loading import Batches
-from dine.data.pairs import PairSet, read_pairs
+from dine.data.pairs import PairSet, read_seen
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
 from dine.models.backbones import BACKBONES, Backbone
@@ -101,10 +101,15 @@ def _run(
     compute: Compute,
     inputs: dict[str, Any],
     facts: dict[str, Any],
+    targets_paths: list[Path] | None = None,
 ) -> None:
-    """Train and write ``model.safetensors``, ``history.csv`` and ``run.json`` into ``out``."""
-    pairs_digests = [file_digest(path) for path in pairs_paths]
-    inputs = {"pairs": pairs_digests, **inputs}
+    """Train and write ``model.safetensors``, ``history.csv`` and ``run.json`` into ``out``.
+
+    Where there are other targets, every pair is trained on twice: with its own and with that.
+    """
+    inputs = {"pairs": [file_digest(path) for path in pairs_paths], **inputs}
+    if targets_paths:
+        inputs["targets"] = [file_digest(path) for path in targets_paths]
     identity = {
         "settings": digest(settings.model_dump()),
         "backbone": digest([backbone.registered_name, backbone.arguments]),
@@ -113,8 +118,11 @@ def _run(
         "inputs": digest(inputs),
         "code": code_digest("model", "training", *(["priors"] if objective.prior else [])),
     }
-    train_pairs = PairSet.concatenate([read_pairs(path, split="train") for path in pairs_paths])
-    val_pairs = PairSet.concatenate([read_pairs(path, split="val") for path in pairs_paths])
+    train_pairs, train_targets = read_seen(pairs_paths, targets_paths, "train")
+    val_pairs, val_targets = read_seen(pairs_paths, targets_paths, "val")
+    if train_targets is not None:
+        train_targets = np.concatenate([train_pairs.target, train_targets])
+        train_pairs = PairSet.concatenate([train_pairs, train_pairs])
     backbone.precision = compute.precision
     began = time.monotonic()
     history = train(
@@ -123,6 +131,8 @@ def _run(
         train_pairs,
         val_pairs,
         settings,
+        train_targets=train_targets,
+        val_targets=val_targets,
         seed=seed,
         folder=out / "training",
         identity=identity,
@@ -193,9 +203,13 @@ def pretrain(
     *,
     seed: int,
     out: Path,
+    targets: list[Path] | None = None,
     compute: Compute = COMPUTE,
 ) -> None:
-    """Train weights to start from, on the true displacements of synthetic pairs."""
+    """Train weights to start from, on the true displacements of synthetic pairs.
+
+    ``targets`` are variants of all pairs of each file, such as resampled ones, to train on as well.
+    """
     _run(
         new_backbone(kind, arguments, seed),
         Objective(DATA_TERMS.get(settings.data_term)()),
@@ -205,6 +219,7 @@ def pretrain(
         out=out,
         name=f"pretraining/{kind}",
         compute=compute,
+        targets_paths=targets,
         inputs={"start": "random"},
         facts={"stage": 0, "backbone": kind, "data": "synthetic", "arguments": arguments},
     )
@@ -247,25 +262,33 @@ def dump_fields(
     *,
     name: str,
     batch_size: int = 4,
+    targets: Path | None = None,
     compute: Compute = COMPUTE,
 ) -> None:
-    """Write a model's displacement fields of the training split to HDF5."""
+    """Write a model's displacement fields of the training split to HDF5.
+
+    ``targets``, a variant of all pairs, stands in for the pairs' own targets.
+    """
     backbone, _ = load_backbone(model)
-    train_pairs = read_pairs(pairs, split="train")
+    train_pairs, seen = read_seen([pairs], [targets] if targets else None, "train")
     fields = predict_fields(
-        backbone, train_pairs, name=name, batch_size=batch_size, compute=compute
+        backbone, train_pairs, name=name, batch_size=batch_size, compute=compute, targets=seen
     )
     with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(format=FIELDS_FORMAT, model=file_digest(model), pairs=file_digest(pairs))
         put_fields(file, train_pairs.name, fields)
 
 
-def fit_prior(fields: Path, prior: PriorConfig, *, seed: int, out: Path) -> None:
-    """Fit a prior to dumped fields and write it, frozen."""
+def fit_prior(fields: list[Path], prior: PriorConfig, *, seed: int, out: Path) -> None:
+    """Fit a prior to dumped fields, of one or more files, and write it, frozen."""
     arguments = check_arguments(prior)
     began = time.monotonic()
-    fitted = PRIORS.get(prior.kind).fit(read_fields(fields), seed=seed, **arguments)
-    fitted.save(out, arguments=arguments, fields=file_digest(fields), seed=seed)
+    parts = [read_fields(path) for path in fields]
+    if len({part.shape[1] for part in parts}) > 1:
+        raise DataError("The files of fields hold different numbers of points; fit one at a time.")
+    fitted = PRIORS.get(prior.kind).fit(np.concatenate(parts), seed=seed, **arguments)
+    digests = [file_digest(path) for path in fields]
+    fitted.save(out, arguments=arguments, fields=digests, seed=seed)
     log.info("fitted the %s prior in %.1f s", prior.kind, time.monotonic() - began)
 
 

@@ -11,7 +11,14 @@ from snakemake.exceptions import WorkflowError
 from dine import config as dine_config
 from dine.errors import ConfigError
 from dine.provenance import code_digest, folder_signature
-from dine.results import Results, conditions, figure_names, runs, table_names
+from dine.results import (
+    Results,
+    conditions,
+    figure_names,
+    pca_priors,
+    runs,
+    table_names,
+)
 
 try:
     CONFIG = dine_config.validate(config)

@@ -50,7 +50,7 @@ rule pretraining_pairs:
     params:
         settings=lambda wildcards: json.dumps(
             {
-                "convention": "none",  # no prior is fitted to these fields
+                "convention": "sphere",  # one for both shapes, as one prior is fitted to both
                 "split": {"train": 0.9, "val": 0.05, "test": 0.05},
             },
             sort_keys=True,
@@ -62,9 +62,29 @@ rule pretraining_pairs:
         " --seed {params.seed} --out {output:q}"
 
 
+# Two scans share no points: half of what is trained on has targets of other points, too.
+rule pretraining_targets:
+    input:
+        raw=rules.pretraining_raw.output,
+        pairs=rules.pretraining_pairs.output,
+    output:
+        PRETRAINING / "{shape}" / "resampled.h5",
+    log:
+        LOGS / "pretraining" / "{shape}_targets.log",
+    conda:
+        "../envs/dine.yaml"
+    params:
+        seed=CONFIG.seed,
+        code=code_digest("pairs"),
+    shell:
+        "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
+        " --seed {params.seed} --out {output:q}"
+
+
 rule pretrain:
     input:
-        expand(rules.pretraining_pairs.output, shape=LEVELS),
+        pairs=expand(rules.pretraining_pairs.output, shape=LEVELS),
+        targets=expand(rules.pretraining_targets.output, shape=LEVELS),
     output:
         model=PRETRAINING / "{backbone}" / "model.safetensors",
         history=PRETRAINING / "{backbone}" / "history.csv",
@@ -80,7 +100,8 @@ rule pretrain:
         gpu=GPUS * PROCESSES,
         processes=PROCESSES,
     params:
-        pairs=lambda wildcards, input: options("--pairs", input),
+        pairs=lambda wildcards, input: options("--pairs", input.pairs),
+        targets=lambda wildcards, input: options("--targets", input.targets),
         backbone=backbone_settings,
         settings=section(CONFIG.pretraining),
         seed=CONFIG.seed,
@@ -88,10 +109,89 @@ rule pretrain:
         code=code_digest("model", "training"),
     shell:
         "dine --log {log:q} --threads {threads} pretrain {params.pairs}"
+        " {params.targets}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
         ' {params.compute} --processes {resources.processes} --out "$(dirname {output.model:q})"'
+
+
+# What `dine register` needs beside the weights: a prior, and what uncertainty means.
+
+
+rule pretraining_fields:
+    input:
+        model=rules.pretrain.output.model,
+        pairs=rules.pretraining_pairs.output,
+        targets=rules.pretraining_targets.output,
+    output:
+        PRETRAINING / "{backbone}" / "fields_{shape}.h5",
+    log:
+        LOGS / "pretraining" / "{backbone}_fields_{shape}.log",
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        compute=COMPUTE,
+        code=code_digest("model"),
+    shell:
+        "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
+        " --pairs {input.pairs:q} --targets {input.targets:q} {params.compute}"
+        " --name 'pretraining/{wildcards.backbone}/{wildcards.shape}' --out {output:q}"
+
+
+rule pretraining_prior:
+    input:
+        expand(
+            rules.pretraining_fields.output,
+            shape=LEVELS,
+            allow_missing=True,
+        ),
+    output:
+        PRETRAINING / "{backbone}" / "prior.safetensors",
+    log:
+        LOGS / "pretraining" / "{backbone}_prior.log",
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    params:
+        fields=lambda wildcards, input: options("--fields", input),
+        settings=json.dumps({"kind": "pca"}),
+        seed=CONFIG.seed,
+        code=code_digest("priors"),
+    shell:
+        "dine --log {log:q} --threads {threads} fit-prior {params.fields}"
+        " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
+
+
+rule pretraining_calibration:
+    input:
+        model=rules.pretrain.output.model,
+        pairs=expand(rules.pretraining_pairs.output, shape=LEVELS),
+        targets=expand(rules.pretraining_targets.output, shape=LEVELS),
+        prior=rules.pretraining_prior.output,
+    output:
+        PRETRAINING / "{backbone}" / "calibration.json",
+        PRETRAINING / "{backbone}" / "calibration.png",
+    log:
+        LOGS / "pretraining" / "{backbone}_calibration.log",
+    conda:
+        "../envs/dine.yaml"
+    threads: THREADS
+    resources:
+        gpu=GPUS,
+    params:
+        pairs=lambda wildcards, input: options("--pairs", input.pairs),
+        targets=lambda wildcards, input: options("--targets", input.targets),
+        device=CONFIG.device,
+        code=code_digest("model", "priors", "calibration"),
+    shell:
+        "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
+        " {params.pairs} {params.targets} --prior {input.prior:q} --device {params.device}"
+        " --out {output[0]:q}"
 
 
 rule pretrained:
     input:
         expand(rules.pretrain.output, backbone=CONFIG.backbones),
+        expand(rules.pretraining_calibration.output, backbone=CONFIG.backbones),

@@ -1,0 +1,112 @@
+"""Where source and target lie to each other: rigid alignment and the normalised frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh.registration
+from scipy.spatial import cKDTree
+
+from dine.errors import DataError
+
+# Starts at other rotations must fit this much better, or symmetric objects would be turned.
+_MUCH_BETTER = 0.5
+_ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """original = normalised · scale + center.
+
+    Attributes:
+        center: (3,) mean of the source's points, in their units.
+        scale: largest distance of one from the center, same units.
+    """
+
+    center: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> Frame:
+        """The frame of (N, 3) source points.
+
+        Raises:
+            DataError: all points coincide.
+        """
+        center = points.mean(axis=0)
+        scale = float(np.linalg.norm(points - center, axis=1).max())
+        if not scale > 0:
+            raise DataError("All points of the source coincide; expected the surface of an object.")
+        return cls(center, scale)
+
+    def normalise(self, points: np.ndarray) -> np.ndarray:
+        return (points - self.center) / self.scale
+
+    def restore(self, points: np.ndarray) -> np.ndarray:
+        return points * self.scale + self.center
+
+
+def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """(N, 3) points moved by a 4×4 matrix."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def check_rigid(matrix: np.ndarray, name: str = "The given alignment") -> np.ndarray:
+    """A 4×4 rotation and translation, as float64.
+
+    Raises:
+        DataError: another shape, or a matrix that scales, shears or mirrors.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise DataError(f"{name} has shape {matrix.shape}; expected a finite 4×4 matrix.")
+    rotation = matrix[:3, :3]
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
+    if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise DataError(
+            f"{name} is not a rotation and a translation; it scales, shears or mirrors. Scale the "
+            "file itself instead."
+        )
+    return matrix
+
+
+def _misfit(a: np.ndarray, b: np.ndarray, tree: cKDTree) -> float:
+    return float((tree.query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean())
+
+
+def rigid_alignment(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The 4×4 rigid motion that brings (N, 3) source points onto (M, 3) target points.
+
+    Iterative closest points (trimesh) from where the points are, from coinciding middles, and from
+    coinciding principal axes; the last are taken only if they fit much better, since a symmetric
+    object fits about as well the wrong way round. The identity is kept where nothing fits better.
+    """
+    tree = cKDTree(target)
+    best, misfit = np.eye(4), _misfit(source, target, tree)
+
+    def attempt(start: np.ndarray, factor: float) -> None:
+        nonlocal best, misfit
+        matrix, _, _ = trimesh.registration.icp(source, target, initial=start, **_ICP)
+        found = _misfit(transformed(source, matrix), target, tree)
+        if found < factor * misfit:
+            best, misfit = matrix, found
+
+    shift = np.eye(4)
+    shift[:3, 3] = target.mean(axis=0) - source.mean(axis=0)
+    attempt(np.eye(4), 1.0)
+    attempt(shift, 1.0)
+    axes = [np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2] for x in (source, target)]
+    reference = misfit
+    turned, lowest = None, _MUCH_BETTER * reference
+    for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        rotation = axes[1].T @ np.diag([*signs, 1.0]) @ axes[0]
+        rotation = axes[1].T @ np.diag([*signs, np.linalg.det(rotation)]) @ axes[0]
+        start = np.eye(4)
+        start[:3, :3] = rotation
+        start[:3, 3] = target.mean(axis=0) - rotation @ source.mean(axis=0)
+        matrix, _, _ = trimesh.registration.icp(source, target, initial=start, **_ICP)
+        found = _misfit(transformed(source, matrix), target, tree)
+        if found < lowest:
+            turned, lowest = matrix, found
+    return best if turned is None else turned

@@ -1,0 +1,181 @@
+"""Many registrations: a manifest in, one folder and one table out."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from dine.data.layout import scan
+from dine.errors import DataError, DineError
+from dine.files import atomic_path, digest, file_digest, read_json, write_json
+from dine.progress import Progress
+from dine.registration.output import Outputs, save
+from dine.registration.register import Model, RegistrationResult, register
+
+log = logging.getLogger(__name__)
+
+_DONE = "done.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One registration of many: a name for its files, and the two shapes."""
+
+    name: str
+    source: Path
+    target: Path
+
+
+def read_jobs(path: Path) -> list[Job]:
+    """The pairs of a manifest, or those found in a folder.
+
+    A manifest is a CSV file with the columns ``source`` and ``target``, paths relative to it, and
+    perhaps ``name``. A folder is read as the pairs step reads one (docs/data-sources.md).
+
+    Raises:
+        DataError: missing, unreadable, without pairs, or names that are not unique.
+    """
+    if path.is_dir():
+        inventory = scan(path)
+        jobs = [
+            Job(f"{pair.level}_{pair.name}", path / pair.source, path / pair.target)
+            for pair in inventory.pairs
+            if pair.condition == "deformation"
+        ]
+    else:
+        jobs = _read_manifest(path)
+    if not jobs:
+        raise DataError(f"{path} names no pairs of a source and a target.")
+    repeated = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
+    if repeated:
+        raise DataError(
+            f"{path}: {len(repeated)} names are used by several pairs, such as {repeated[0]!r}; "
+            "give every row a name of its own."
+        )
+    return jobs
+
+
+def _read_manifest(path: Path) -> list[Job]:
+    try:
+        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} is not a readable CSV file ({error}).") from None
+    missing = [column for column in ("source", "target") if column not in table]
+    if missing:
+        raise DataError(f"{path} lacks the column {missing[0]!r}; expected source and target.")
+    jobs = []
+    for number, row in enumerate(table.to_dict("records"), start=1):
+        source, target = (path.parent / row[key] for key in ("source", "target"))
+        name = row.get("name") or f"{source.stem}_to_{target.stem}"
+        if not row["source"] or not row["target"] or Path(name).name != name:
+            raise DataError(
+                f"{path}, row {number}: expected a source, a target and, if any, a plain name."
+            )
+        jobs.append(Job(name, source, target))
+    return jobs
+
+
+def register_many(
+    jobs: list[Job],
+    out: Path,
+    model: Model,
+    *,
+    suffix: str = "",
+    view: bool = False,
+    settings: dict | None = None,
+    load: Callable[[Job], dict] | None = None,
+) -> pd.DataFrame:
+    """Register every pair into a folder of its own; what is done already is not done again.
+
+    A pair that cannot be registered is reported and does not stop the rest.
+
+    Args:
+        jobs: from :func:`read_jobs`.
+        out: folder of all results; ``summary.csv`` in it has one row a pair.
+        model: from ``load_model``.
+        suffix: format of the moved sources, such as ``.ply``; by default that of each source.
+        view: write the pages to look at, too.
+        settings: further arguments of ``register``.
+        load: further arguments of ``register`` for one pair.
+
+    Returns:
+        The summary.
+    """
+    settings = settings or {}
+    rows = []
+    with Progress("registrations", len(jobs), unit="pair") as progress:
+        for job in jobs:
+            folder = out / job.name
+            try:
+                rows.append(
+                    {"name": job.name, **_one(job, folder, model, suffix, view, settings, load)}
+                )
+            except DineError as error:
+                log.warning("%s: %s", job.name, error)
+                rows.append({"name": job.name, "state": "failed", "message": str(error)})
+            progress.update()
+    summary = pd.DataFrame(rows)
+    with atomic_path(out / "summary.csv") as temporary:
+        summary.to_csv(temporary, index=False, float_format="%.6g")
+    return summary
+
+
+def _one(
+    job: Job,
+    folder: Path,
+    model: Model,
+    suffix: str,
+    view: bool,
+    settings: dict,
+    load: Callable[[Job], dict] | None,
+) -> dict:
+    for path in (job.source, job.target):
+        if not path.is_file():
+            raise DataError(f"{path} does not exist.")
+    identity = digest(
+        {
+            "source": file_digest(job.source),
+            "target": file_digest(job.target),
+            "weights": file_digest(model.weights),
+            "prior": model.prior_path and file_digest(model.prior_path),
+            "settings": {k: str(v) for k, v in settings.items()},
+            "suffix": suffix,
+            "view": view,
+        }
+    )
+    outputs = Outputs(folder / f"moved{suffix or job.source.suffix}")
+    mark = folder / _DONE
+    if mark.is_file() and outputs.report.is_file():
+        done = read_json(mark)
+        if done.get("identity") == identity:
+            return done["row"]
+    outputs.check({}, view=view, overwrite=True)
+    result = register(
+        job.source, job.target, model=model, **settings, **(load(job) if load else {})
+    )
+    save(result, outputs, colors_from=job.source, view=view, overwrite=True)
+    row = _row(result)
+    write_json(mark, {"identity": identity, "row": row})
+    return row
+
+
+def _row(result: RegistrationResult) -> dict:
+    report = result.report
+    return {
+        "state": "done",
+        "message": " ".join(result.trust.reasons),
+        "verdict": result.trust.verdict,
+        "expected_error": result.trust.expected_error,
+        "chamfer_before": report["before"]["chamfer"],
+        "chamfer_after": report["after"]["chamfer"],
+        "hd95_before": report["before"]["hd95"],
+        "hd95_after": report["after"]["hd95"],
+        "folding": report["folding"],
+        "displacement_max": report["displacement"]["max"],
+        "seconds": report["seconds"],
+    }

@@ -1,0 +1,163 @@
+"""The files of one registration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dine.data.surface import Surface
+from dine.errors import DataError
+from dine.files import write_json
+from dine.registration.register import RegistrationResult
+from dine.registration.view import write_view
+from dine.registration.write import (
+    SURFACE_SUFFIXES,
+    check_output,
+    read_colors,
+    write_field,
+    write_moved,
+)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where everything goes, beside the moved source ``NAME.SUFFIX``.
+
+    ``NAME.field.npz`` and ``NAME.field.vtp`` hold the displacement of every vertex,
+    ``NAME.json`` the report, ``NAME.html`` the view, ``NAME.<shape>.<suffix>`` further shapes.
+    """
+
+    moved: Path
+
+    def beside(self, ending: str) -> Path:
+        return self.moved.with_name(f"{self.moved.stem}.{ending}")
+
+    @property
+    def report(self) -> Path:
+        return self.beside("json")
+
+    @property
+    def view(self) -> Path:
+        return self.beside("html")
+
+    def applied(self, name: str, suffix: str) -> Path:
+        return self.beside(f"{name}{suffix}")
+
+    def check(self, applied: Mapping[str, Path], *, view: bool, overwrite: bool) -> None:
+        """Refuse what could not be written, before anything is computed.
+
+        Raises:
+            DataError: a suffix that is not written, or that of the report.
+            StorageError: a file is there already.
+        """
+        check_output(self.moved, SURFACE_SUFFIXES, overwrite=overwrite)
+        others = [self.beside("field.npz"), self.beside("field.vtp"), self.report]
+        others += [self.view] * view
+        if self.moved in others:
+            raise DataError(f"{self.moved} is the name of another output; choose another one.")
+        for path in others:
+            check_output(path, [path.suffix], overwrite=overwrite)
+        for name, path in applied.items():
+            check_output(self.applied(name, path.suffix), SURFACE_SUFFIXES, overwrite=overwrite)
+
+
+def save(
+    result: RegistrationResult,
+    outputs: Outputs,
+    *,
+    colors_from: Path | None = None,
+    applied: Mapping[str, Path] | None = None,
+    view: bool = False,
+    overwrite: bool = False,
+) -> list[str]:
+    """Write everything; the report comes last, so where it is the rest is whole.
+
+    Args:
+        result: from ``register``.
+        outputs: where to.
+        colors_from: the source's file, whose vertex colours are kept.
+        applied: files of the further shapes, which say in what format to write them.
+        view: write the page to look at, too.
+        overwrite: replace files that are there already.
+
+    Returns:
+        Sentences on what a format could not hold.
+    """
+    scalars = _scalars(result)
+    colors = read_colors(colors_from, result.source) if colors_from else None
+    left_out = write_moved(
+        outputs.moved,
+        result.moved,
+        colors=colors,
+        scalars=_words(scalars),
+        overwrite=overwrite,
+    )
+    said = [f"{outputs.moved.name} cannot hold: {', '.join(left_out)}."] if left_out else []
+    field = {
+        "points": result.source.vertices,
+        "displacement": result.displacement,
+        "faces": result.source.faces,
+        "scalars": _words(scalars),
+    }
+    for ending in ("field.npz", "field.vtp"):
+        write_field(outputs.beside(ending), **field, overwrite=overwrite)
+    for name, surface in result.applied.items():
+        suffix = applied[name].suffix if applied else ".ply"
+        write_moved(outputs.applied(name, suffix), surface, overwrite=overwrite)
+    if view:
+        write_view(
+            outputs.view,
+            _aligned_source(result),
+            result.target,
+            result.moved.vertices,
+            scalars=scalars,
+            title=f"{result.source.name} → {result.target.name}",
+            facts=_facts(result),
+            overwrite=overwrite,
+        )
+    write_json(outputs.report, result.report)
+    return said
+
+
+def _aligned_source(result: RegistrationResult) -> Surface:
+    """The source as the network got it: what is shown to deform should not also fly in."""
+    matrix = np.array(result.report["alignment"])
+    vertices = result.source.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    return Surface(vertices, result.source.faces, name=result.source.name)
+
+
+def _scalars(result: RegistrationResult) -> dict[str, np.ndarray]:
+    shown = {
+        "displacement": np.linalg.norm(
+            result.moved.vertices - _aligned_source(result).vertices, axis=1
+        ),
+        "distance to target": result.distance_to_target,
+    }
+    if result.uncertainty is not None:
+        shown["expected error"] = result.uncertainty
+    return shown
+
+
+def _words(scalars: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    renamed = {"displacement": "displacement_length"}
+    return {renamed.get(k, k.replace(" ", "_")): value for k, value in scalars.items()}
+
+
+def _facts(result: RegistrationResult) -> dict[str, str]:
+    report = result.report
+    facts = {
+        "HD95": f"{report['before']['hd95']:.3g} → {report['after']['hd95']:.3g}",
+        "Largest displacement": f"{report['displacement']['max']:.3g}",
+        "Folded": f"{100 * report['folding']:.1f} %",
+        "Verdict": result.trust.verdict,
+    }
+    if result.trust.expected_error is not None:
+        facts["Expected error"] = f"{result.trust.expected_error:.3g}"
+    if result.trust.reasons:
+        facts["Note"] = " ".join(result.trust.reasons)
+    facts["Backbone"] = str(report["backbone"])
+    facts["Time"] = f"{report['seconds']:.1f} s"
+    return facts

@@ -1,0 +1,462 @@
+"""Two scans in, one registration out."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+from click.testing import CliRunner
+
+import dine
+from dine.cli import cli
+from dine.data.pairs import PAIR_DATASETS, PairSet, write_pairs
+from dine.data.readers import read_surface, write_surface
+from dine.data.surface import Surface
+from dine.errors import CheckpointError, ConfigError, DataError, DineError
+from dine.models.backbones import BACKBONES
+from dine.models.checkpoint import save_backbone
+from dine.priors.pca import PCAPrior
+from dine.registration.calibration import Calibration, load_calibration, plausibility
+from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
+from dine.registration.quality import fit, folding, landmark_errors
+from dine.registration.register import Model, load_model
+from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
+
+POINTS = 256
+
+
+def bump(vertices):
+    """A smooth synthetic deformation."""
+    return vertices + 0.08 * np.sin(2.5 * vertices[:, [1, 2, 0]])
+
+
+def organ(subdivisions=3):
+    """A closed mesh without symmetry, of unit size."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
+    x, y, z = mesh.vertices.T
+    radius = 1 + 0.25 * np.sin(2 * x + 0.3) + 0.15 * y + 0.1 * np.cos(3 * z) * x
+    return Surface(mesh.vertices * radius[:, None] * [1, 0.8, 0.6], mesh.faces, name="organ")
+
+
+@pytest.fixture(scope="module")
+def pair():
+    source = organ()
+    return source, Surface(bump(source.vertices), source.faces, name="deformed organ")
+
+
+@pytest.fixture(scope="module")
+def result(pair):
+    return dine.register(*pair, points=POINTS)
+
+
+def turned(degrees=40.0):
+    matrix = trimesh.transformations.rotation_matrix(np.radians(degrees), [0.3, 1, 0.2])
+    matrix[:3, 3] = [0.5, -0.2, 0.3]
+    return matrix
+
+
+# --- parts ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degrees", [0, 20, 160])
+def test_alignment_finds_a_rigid_motion(degrees):
+    points = organ().vertices
+    matrix = turned(degrees)
+    rng = np.random.default_rng(0)
+    target = transformed(points, matrix)[rng.permutation(len(points))]
+    found = rigid_alignment(points, target)
+    assert np.abs(transformed(points, found) - transformed(points, matrix)).max() < 0.02
+
+
+def test_alignment_leaves_what_fits_already():
+    points = organ().vertices
+    assert np.abs(rigid_alignment(points, points) - np.eye(4)).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    "matrix", [np.eye(3), 2 * np.eye(4), np.diag([-1.0, 1, 1, 1]), np.full((4, 4), np.nan)]
+)
+def test_only_rigid_matrices_are_taken(matrix):
+    with pytest.raises(DataError, match=r"4×4|scales, shears or mirrors"):
+        check_rigid(matrix)
+
+
+def test_frame_goes_there_and_back():
+    points = 1000 * np.random.default_rng(1).normal(size=(50, 3)) + 7
+    frame = Frame.of(points)
+    inside = frame.normalise(points)
+    assert np.linalg.norm(inside, axis=1).max() == pytest.approx(1)
+    assert np.allclose(frame.restore(inside), points)
+
+
+def test_fit_is_what_its_names_say():
+    rng = np.random.default_rng(2)
+    a, b = rng.normal(size=(2, 40, 3))
+    table = np.linalg.norm(a[:, None] - b[None], axis=2)
+    there, back = table.min(axis=1), table.min(axis=0)
+    found = fit(a, b)
+    assert found["chamfer"] == pytest.approx((there**2).mean() + (back**2).mean())
+    assert found["chamfer_unsquared"] == pytest.approx(there.mean() + back.mean())
+    assert found["hausdorff"] == pytest.approx(max(there.max(), back.max()))
+    expected = max(np.percentile(there, 95), np.percentile(back, 95))
+    assert found["hd95"] == pytest.approx(expected)
+    assert fit(a, b, partial=True)["chamfer"] == pytest.approx((back**2).mean())
+
+
+def test_folding_is_the_share_turned_inside_out():
+    points = organ().vertices
+    assert folding(points, np.zeros_like(points)) == 0
+    assert folding(points, bump(points) - points) == 0
+    assert folding(points, 0.3 * points + 1) == 0
+    mirrored = points * [-1, 1, 1]
+    assert folding(points, mirrored - points) > 0.5
+    half = np.where(points[:, :1] > 0, mirrored, points)
+    assert 0.1 < folding(points, half - points) < 0.9
+    assert folding(points[:3], points[:3]) == 0
+
+
+def test_landmark_errors_are_distances():
+    a = np.zeros((2, 3))
+    assert landmark_errors(a, np.array([[3.0, 4, 0], [0, 0, 1]])) == {"mean": 3.0, "max": 5.0}
+
+
+def calibration(**facts):
+    reference = {"initial": [1, 2, 3], "final": [0.1, 0.2], "folding": [0.0, 0.001]}
+    reference |= {"in_span": [1, 2], "residual": [1, 2], "reach": [0.5, 1.0]}
+    return Calibration([0.1, 0.2], [0.01, 0.05], [0.02, 0.1], reference, facts)
+
+
+def test_calibration_interpolates_and_ranks(tmp_path):
+    made = calibration(points=3)
+    assert made.expected_error(np.array([0.0, 0.15, 9.0])).tolist() == pytest.approx(
+        [0.01, 0.03, 0.05]
+    )
+    assert made.percentile("initial", 2.5) == pytest.approx(200 / 3)
+    made.save(tmp_path / "c.json")
+    assert load_calibration(tmp_path / "c.json") == made
+    (tmp_path / "d.json").write_text('{"format": "something"}')
+    with pytest.raises(DataError, match="dine calibrate"):
+        load_calibration(tmp_path / "d.json")
+
+
+@pytest.mark.parametrize(
+    ("values", "verdict", "said"),
+    [
+        ({"initial": 2.0, "final": 0.1, "folding": 0.0, "in_span": 1.5}, GOOD, None),
+        ({"initial": 9.0}, DOUBTFUL, "before registration"),
+        ({"final": 0.3}, DOUBTFUL, "fits the target worse"),
+        ({"in_span": 90.0}, IMPLAUSIBLE, "less likely"),
+        ({"in_span": 2.5, "residual": 2.5}, IMPLAUSIBLE, "principal components"),
+        ({"folding": 0.3}, IMPLAUSIBLE, "inside out"),
+        ({"folding": 0.03}, DOUBTFUL, "inside out"),
+    ],
+)
+def test_verdicts(values, verdict, said):
+    trust = assess(calibration(), values, 0.1)
+    assert trust.verdict == verdict
+    assert trust.reasons == () if said is None else said in " ".join(trust.reasons)
+
+
+def test_without_calibration_nothing_is_called_plausible():
+    trust = assess(None, {"folding": 0.0}, None)
+    assert trust.verdict == DOUBTFUL
+    assert "no calibration" in trust.reasons[0]
+
+
+def test_plausibility_separates_inside_from_outside():
+    rng = np.random.default_rng(3)
+    modes = rng.normal(size=(4, 20, 3))
+    fields = np.einsum("km,mnd->knd", rng.normal(size=(60, 4)), modes)
+    prior = PCAPrior.fit(fields, components=4)
+    inside = plausibility(prior, fields[0])
+    outside = plausibility(prior, fields[0] + rng.normal(size=(20, 3)))
+    assert inside["residual"] < 1e-6 < 0.01 < outside["residual"]
+    assert plausibility(prior, 10 * fields[0])["in_span"] > 50 * inside["in_span"]
+    assert plausibility(prior, fields[0][:10]) is None
+
+
+# --- whole registrations --------------------------------------------------------------------------
+
+
+def error(moved, target):
+    return np.linalg.norm(moved.vertices - target.vertices, axis=1).mean()
+
+
+def test_registration_brings_the_source_to_its_target(pair, result):
+    source, target = pair
+    assert error(result.moved, target) < 0.6 * error(source, target)
+    assert result.report["after"]["hd95"] < result.report["before"]["hd95"]
+    assert (result.moved.faces == source.faces).all()
+    assert np.allclose(result.moved.vertices, source.vertices + result.displacement)
+    assert result.supported.all()
+    json.dumps(result.report, allow_nan=False)
+
+
+def test_units_and_place_do_not_matter(pair, result):
+    moved = [Surface(1000 * s.vertices + 300, s.faces, name=s.name) for s in pair]
+    found = dine.register(*moved, points=POINTS)
+    assert np.allclose(found.moved.vertices, 1000 * result.moved.vertices + 300, atol=2)
+    assert found.report["normalised"] == pytest.approx(result.report["normalised"], rel=0.05)
+
+
+def test_the_same_seed_gives_the_same_result(pair, result):
+    again = dine.register(*pair, points=POINTS)
+    assert (again.moved.vertices == result.moved.vertices).all()
+    other = dine.register(*pair, points=POINTS, seed=1)
+    assert (other.moved.vertices != result.moved.vertices).any()
+
+
+def test_a_turned_source_is_aligned_first(pair, result):
+    source, target = pair
+    away = Surface(transformed(source.vertices, turned()), source.faces)
+    found = dine.register(away, target, points=POINTS)
+    assert error(found.moved, target) < 0.6 * error(source, target)
+    given = dine.register(away, target, points=POINTS, prealign=np.linalg.inv(turned()))
+    assert error(given.moved, target) < 0.6 * error(source, target)
+    off = dine.register(away, target, points=POINTS, prealign="off")
+    assert off.report["alignment"] == np.eye(4).tolist()
+
+
+def test_further_shapes_and_landmarks_move_along(pair):
+    source, target = pair
+    inside = Surface(0.5 * source.vertices[:40], name="tumour")
+    marks = source.vertices[::50], target.vertices[::50]
+    found = dine.register(source, target, points=POINTS, apply={"tumour": inside}, landmarks=marks)
+    truth = bump(inside.vertices)
+    after = np.linalg.norm(found.applied["tumour"].vertices - truth, axis=1).mean()
+    assert after < np.linalg.norm(inside.vertices - truth, axis=1).mean()
+    assert found.report["landmarks"]["after"]["mean"] < found.report["landmarks"]["before"]["mean"]
+    assert found.report["landmarks"]["count"] == len(marks[0])
+
+
+def test_clouds_of_few_points_are_taken_whole(pair):
+    source, target = (Surface(s.vertices[::4]) for s in pair)
+    found = dine.register(source.vertices, target.vertices)
+    assert len(found.points) == len(source.vertices) < 1024
+    assert error(found.moved, target) < error(source, target)
+
+
+def test_a_partial_target_pulls_only_what_it_shows(pair):
+    source, target = pair
+    shown = target.vertices[target.vertices[:, 0] > -0.1]
+    pulled = dine.register(source, shown, points=POINTS, prealign="off")
+    found = dine.register(source, shown, points=POINTS, prealign="off", partial=True)
+    assert 0.3 < found.report["supported"] < 0.95
+    assert "no counterpart" in " ".join(found.trust.reasons)
+    assert error(found.moved, target) < 0.5 * error(pulled.moved, target)
+
+
+def test_refinement_lowers_the_distance(pair):
+    shipped = load_model()
+    fields = 0.1 * np.random.default_rng(4).normal(size=(10, POINTS, 3))
+    model = Model(shipped.backbone, shipped.weights, shipped.facts, PCAPrior.fit(fields))
+    plain = dine.register(*pair, points=POINTS, model=model)
+    refined = dine.register(*pair, points=POINTS, model=model, map_steps=40)
+    assert refined.report["normalised"]["final"] < plain.report["normalised"]["final"]
+    assert refined.report["folding"] <= plain.report["folding"] + 0.01
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+LINE = np.outer(np.linspace(0, 1, 100), [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        (np.zeros((1, 3)), "coincide"),
+        (np.ones((50, 3)), "coincide"),
+        (np.random.default_rng(5).normal(size=(8, 3)), "distinct points"),
+        (LINE, "on one line"),
+        (np.full((50, 3), np.nan), "NaN"),
+        (np.zeros((50, 2)), "shape"),
+        (np.zeros((0, 3)), "no vertices"),
+        (1000 * np.random.default_rng(6).normal(size=(200, 3)), "metres and the other in milli"),
+        (25.4 * np.random.default_rng(6).normal(size=(200, 3)), "inches"),
+    ],
+)
+def test_bad_shapes_are_refused(source, said):
+    with pytest.raises(DataError, match=said):
+        dine.register(source, np.random.default_rng(7).normal(size=(200, 3)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"prealign": "perhaps"}, "auto, off"),
+        ({"points": 3}, "at least"),
+        ({"landmarks": (np.zeros((2, 3)), np.zeros((3, 3)))}, "landmarks"),
+    ],
+)
+def test_bad_settings_are_refused(pair, settings, said):
+    with pytest.raises(DineError, match=said):
+        dine.register(*pair, **{"points": POINTS, **settings})
+
+
+def test_objects_without_anything_in_common_are_not_called_plausible(pair):
+    source = pair[0]
+    plate = np.random.default_rng(8).uniform(-1, 1, size=(2000, 3)) * [1.5, 1.5, 0.01]
+    assert dine.register(source, plate, points=POINTS).trust.verdict != GOOD
+
+
+def test_weights_must_fit(tmp_path):
+    other = tmp_path / "w.safetensors"
+    save_backbone(other, BACKBONES.get("deftransnet")())
+    with pytest.raises(ConfigError, match="holds weights of deftransnet"):
+        load_model("robust_defreg_of_mine", weights=other)
+    assert load_model(weights=other).backbone.registered_name == "deftransnet"
+    other.write_bytes(b"nothing")
+    with pytest.raises(CheckpointError):
+        load_model(weights=other)
+    with pytest.raises(ConfigError, match="no pretrained weights"):
+        load_model("unheard_of")
+
+
+def test_a_calibration_of_other_weights_is_refused(tmp_path):
+    calibration(model="another").save(tmp_path / "c.json")
+    with pytest.raises(DataError, match="other weights"):
+        load_model(calibration=tmp_path / "c.json")
+
+
+# --- commands -------------------------------------------------------------------------------------
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli, [str(a) for a in arguments])
+
+
+@pytest.fixture
+def files(tmp_path, pair):
+    paths = tmp_path / "before.ply", tmp_path / "after scan.ply"
+    for path, surface in zip(paths, pair, strict=True):
+        write_surface(path, surface)
+    return paths
+
+
+def test_command_writes_everything(files, tmp_path, pair):
+    out = tmp_path / "out" / "moved.obj"
+    done = run("register", *files, "-o", out, "--points", POINTS, "--view", "--apply", files[0])
+    assert done.exit_code == 0, done.output
+    assert "HD95" in done.output
+    endings = {"obj", "field.npz", "field.vtp", "json", "html", "before.ply"}
+    assert {p.name.removeprefix("moved.") for p in out.parent.iterdir()} == endings
+    moved = read_surface(out)
+    assert (moved.faces == pair[0].faces).all()
+    report = json.loads(out.with_suffix(".json").read_text())
+    with np.load(out.with_suffix(".field.npz")) as field:
+        assert np.allclose(field["points"] + field["displacement"], moved.vertices)
+    assert np.allclose(read_surface(out.with_suffix(".before.ply")).vertices, moved.vertices)
+    assert report["weights"]["sha256"]
+
+
+def test_command_keeps_what_exists(files, tmp_path):
+    out = tmp_path / "moved.ply"
+    out.with_suffix(".json").write_text("precious")
+    done = run("register", *files, "-o", out)
+    assert isinstance(done.exception, DineError)
+    assert "exists already" in str(done.exception)
+    assert out.with_suffix(".json").read_text() == "precious"
+    assert not out.exists()
+    assert run("register", *files, "-o", out, "--points", 64, "--overwrite").exit_code == 0
+
+
+def test_command_refuses_unreadable_alignments_and_files(files, tmp_path):
+    bad = tmp_path / "bad.txt"
+    bad.write_text("1 2 3")
+    for arguments in (
+        (*files, "--prealign", bad),
+        (*files, "--prealign", tmp_path / "none.txt"),
+        (files[0], tmp_path / "none.ply"),
+        (files[0], bad),
+    ):
+        done = run("register", *arguments, "-o", tmp_path / "m.ply", "--points", 64)
+        assert isinstance(done.exception, DineError), done.output
+        assert not (tmp_path / "m.ply").exists()
+
+
+def test_many_pairs_go_on_where_they_stopped(files, tmp_path):
+    manifest = tmp_path / "pairs.csv"
+    rows = [
+        {"source": files[0].name, "target": files[1].name, "name": "first"},
+        {"source": "missing.ply", "target": files[1].name, "name": "second"},
+    ]
+    pd.DataFrame(rows).to_csv(manifest, index=False)
+    out = tmp_path / "many"
+    arguments = ("register-many", manifest, "-o", out, "--points", 64)
+    assert run(*arguments).exit_code == 1
+    summary = pd.read_csv(out / "summary.csv").set_index("name")
+    assert summary["state"].to_dict() == {"first": "done", "second": "failed"}
+    assert "missing.ply" in summary.loc["second", "message"]
+    moved = out / "first" / "moved.ply"
+    before = moved.stat().st_mtime_ns
+    (tmp_path / "missing.ply").write_bytes(files[0].read_bytes())
+    assert run(*arguments).exit_code == 0
+    assert moved.stat().st_mtime_ns == before
+    assert (pd.read_csv(out / "summary.csv")["state"] == "done").all()
+    write_surface(files[0], Surface(organ().vertices * 1.1, organ().faces))
+    assert run(*arguments).exit_code == 0
+    assert moved.stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("source\na.ply\n", "column 'target'"),
+        ("source,target\n,b.ply\n", "row 1"),
+        ("source,target,name\na.ply,b.ply,../x\n", "row 1"),
+        ("source,target,name\na.ply,b.ply,x\na.ply,b.ply,x\n", "name of its own"),
+        ("source,target\n", "no pairs"),
+    ],
+)
+def test_bad_manifests_are_refused(tmp_path, content, said):
+    path = tmp_path / "pairs.csv"
+    path.write_text(content)
+    done = run("register-many", path, "-o", tmp_path / "out")
+    assert isinstance(done.exception, DineError)
+    assert said in str(done.exception)
+
+
+def test_calibration_of_own_weights(tmp_path):
+    rng = np.random.default_rng(9)
+    base = organ(2).vertices
+    base = base / np.linalg.norm(base, axis=1).max()
+    count, points = 12, len(base)
+    scale = rng.uniform(0.3, 1.2, size=(count, 1, 1))
+    source = np.repeat(base[None], count, axis=0)
+    target = source + scale * (bump(base) - base)
+    columns = {
+        "source": source,
+        "target": target,
+        "center": np.zeros((count, 3)),
+        "scale": np.ones(count),
+        "level": np.full(count, 0.3),
+        "name": np.array([f"p{i}" for i in range(count)]),
+        "object": np.array([f"o{i}" for i in range(count)]),
+        "split": np.array(["train"] * 4 + ["val"] * 4 + ["test"] * 4),
+        "source_file": np.array(["a"] * count),
+        "target_file": np.array(["b"] * count),
+        "vertex_index": np.zeros((count, points, 3), int),
+        "vertex_weight": np.tile([1.0, 0, 0], (count, points, 1)),
+    }
+    assert set(columns) == set(PAIR_DATASETS)
+    pairs = tmp_path / "pairs.h5"
+    write_pairs(pairs, PairSet(**columns, attributes={"convention": "none", "origin": "synthetic"}))
+    weights = load_model().weights
+    prior = tmp_path / "prior.safetensors"
+    PCAPrior.fit(target[:4] - source[:4]).save(prior)
+    out = tmp_path / "calibration.json"
+    done = run(*("calibrate", "--model", weights, "--pairs", pairs, "--prior", prior, "--out", out))
+    assert done.exit_code == 0, done.exception
+    found = load_calibration(out)
+    assert (np.diff(found.error) >= 0).all()
+    assert (np.diff(found.likely) >= 0).all()
+    assert found.facts["convention"] == "none"
+    assert 0.5 < found.facts["test_inside_likely"] <= 1
+    assert {"initial", "final", "in_span", "residual"} <= set(found.reference)
+    assert out.with_suffix(".png").stat().st_size > 5000
+    model = load_model(weights=weights, prior=prior, calibration=out)
+    result = dine.register(source[0], target[0], model=model)
+    assert result.uncertainty.shape == (points,)
+    assert (result.uncertainty >= 0).all()
+    assert result.trust.expected_error > 0
