@@ -22,13 +22,14 @@ class Registration:
 
     Attributes:
         displacement: (B, N, 3) in the normalised frame, zero at padded points.
-        candidates: the candidate displacements that belief propagation chose among.
+        candidates: the candidate displacements that belief propagation chose among; None, as is
+            the belief, where a backbone works otherwise.
         belief: (B, N, K) cost of every candidate; softmax(−temperature·belief) are the weights.
     """
 
     displacement: Tensor
-    candidates: Candidates
-    belief: Tensor
+    candidates: Candidates | None
+    belief: Tensor | None
 
 
 class Backbone(nn.Module):
