@@ -204,6 +204,8 @@ class Training(Section):
     """Validation pairs, spread evenly over the split."""
     save_seconds: Positive = 20.0
     """Longest time between two saved training states."""
+    parts: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of the steps whose source is cut down to a part; for data terms on displacements."""
 
 
 class Stage1(Training):
@@ -242,6 +244,8 @@ class Pretraining(Training):
     data_term: str = "l1"
     steps: Count = 4000
     learning_rate: Positive = 1.0e-3
+    parts: Annotated[float, Field(ge=0, le=1)] = 0.25
+    """Share of the steps whose source is cut down to a part, as scans often show one."""
     objects: Count = 240
     """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
 

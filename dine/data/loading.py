@@ -30,11 +30,20 @@ class Batches:
         pairs: where the batches come from.
         device: where they go.
         targets: (P, M, 3), stands in for the pairs' clean targets; the truth stays theirs.
+        parts: share of the shuffled pairs whose source is cut down to a part of itself, which then
+            gives the frame.
     """
 
-    def __init__(self, pairs: PairSet, device: torch.device, targets: np.ndarray | None = None):
+    def __init__(
+        self,
+        pairs: PairSet,
+        device: torch.device,
+        targets: np.ndarray | None = None,
+        parts: float = 0.0,
+    ):
         self.pairs = pairs
         self.device = device
+        self.parts = parts
         self._targets = pairs.target if targets is None else targets
         self._graphs: dict[bytes, Graph] = {}
 
@@ -64,16 +73,26 @@ class Batches:
         return self._graphs[key]
 
     def _make(self, indices: Sequence[int], keys: Sequence[Sequence[int]] | None) -> Loaded:
+        sources = [self.pairs.source[i] for i in indices]
         clouds = [self._targets[i] for i in indices]
-        if keys is not None:
-            clouds = [
-                cloud[np.random.default_rng(key).permutation(len(cloud))]
-                for cloud, key in zip(clouds, keys, strict=True)
-            ]
-        batch = make_batch(
-            [self.pairs.source[i] for i in indices], clouds, [self._graph(i) for i in indices]
-        )
-        truth = torch.from_numpy(self.pairs.target[indices] - self.pairs.source[indices])
+        graphs = [self._graph(i) for i in indices]
+        moves = [self.pairs.target[i] - self.pairs.source[i] for i in indices]
+        for row, key in enumerate(keys or ()):
+            rng = np.random.default_rng(key)
+            clouds[row] = clouds[row][rng.permutation(len(clouds[row]))]
+            if self.parts and rng.random() < self.parts:
+                kept = _part(sources[row], rng)
+                center = sources[row][kept].mean(axis=0)
+                source = sources[row][kept] - center
+                scale = np.linalg.norm(source, axis=1).max()
+                sources[row] = source / scale
+                clouds[row] = (clouds[row] - center) / scale
+                moves[row] = moves[row][kept] / scale
+                graphs[row] = neighbour_graph(sources[row], GRAPH_NEIGHBOURS)
+        batch = make_batch(sources, clouds, graphs)
+        truth = torch.zeros_like(batch.source)
+        for row, move in zip(truth, moves, strict=True):
+            row[: len(move)] = torch.from_numpy(move)
         if self.device.type != "cuda":
             return batch, truth
         # A thread starts on the first GPU, which belongs to another process where there are more.
@@ -86,3 +105,11 @@ class Batches:
             batch.to(self.device, non_blocking=True),
             truth.to(self.device, non_blocking=True),
         )
+
+
+def _part(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Indices of the 30 to 90 % of (N, 3) points that are nearest to a random one."""
+    center = points[rng.integers(len(points))]
+    share = rng.uniform(0.3, 0.9)
+    order = np.argsort(np.linalg.norm(points - center, axis=1), kind="stable")
+    return np.sort(order[: max(GRAPH_NEIGHBOURS + 1, round(share * len(points)))])

@@ -71,42 +71,45 @@ def check_rigid(matrix: np.ndarray, name: str = "The given alignment") -> np.nda
     return matrix
 
 
-def _misfit(a: np.ndarray, b: np.ndarray, tree: cKDTree) -> float:
-    return float((tree.query(a)[0] ** 2).mean() + (cKDTree(a).query(b)[0] ** 2).mean())
-
-
-def rigid_alignment(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def rigid_alignment(source: np.ndarray, target: np.ndarray, *, partial: bool = False) -> np.ndarray:
     """The 4×4 rigid motion that brings (N, 3) source points onto (M, 3) target points.
 
     Iterative closest points (trimesh) from where the points are, from coinciding middles, and from
     coinciding principal axes; the last are taken only if they fit much better, since a symmetric
     object fits about as well the wrong way round. The identity is kept where nothing fits better.
+
+    With ``partial`` the target is brought onto the source, of which it is a part, and the inverse
+    is returned: every point of the part has a counterpart in the whole, but not the other way.
     """
-    tree = cKDTree(target)
-    best, misfit = np.eye(4), _misfit(source, target, tree)
+    if partial:
+        return np.linalg.inv(_alignment(target, source, both_ways=False))
+    return _alignment(source, target, both_ways=True)
 
-    def attempt(start: np.ndarray, factor: float) -> None:
-        nonlocal best, misfit
-        matrix, _, _ = trimesh.registration.icp(source, target, initial=start, **_ICP)
-        found = _misfit(transformed(source, matrix), target, tree)
-        if found < factor * misfit:
-            best, misfit = matrix, found
 
-    shift = np.eye(4)
-    shift[:3, 3] = target.mean(axis=0) - source.mean(axis=0)
-    attempt(np.eye(4), 1.0)
-    attempt(shift, 1.0)
-    axes = [np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2] for x in (source, target)]
-    reference = misfit
-    turned, lowest = None, _MUCH_BETTER * reference
-    for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-        rotation = axes[1].T @ np.diag([*signs, 1.0]) @ axes[0]
-        rotation = axes[1].T @ np.diag([*signs, np.linalg.det(rotation)]) @ axes[0]
+def _alignment(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray:
+    tree = cKDTree(b)
+
+    def misfit(matrix: np.ndarray) -> float:
+        moved = transformed(a, matrix)
+        there = float((tree.query(moved)[0] ** 2).mean())
+        return there + float((cKDTree(moved).query(b)[0] ** 2).mean()) if both_ways else there
+
+    def improved(start: np.ndarray) -> tuple[float, np.ndarray]:
+        matrix, _, _ = trimesh.registration.icp(a, b, initial=start, **_ICP)
+        return misfit(matrix), matrix
+
+    def shifted(rotation: np.ndarray) -> np.ndarray:
         start = np.eye(4)
         start[:3, :3] = rotation
-        start[:3, 3] = target.mean(axis=0) - rotation @ source.mean(axis=0)
-        matrix, _, _ = trimesh.registration.icp(source, target, initial=start, **_ICP)
-        found = _misfit(transformed(source, matrix), target, tree)
-        if found < lowest:
-            turned, lowest = matrix, found
-    return best if turned is None else turned
+        start[:3, 3] = b.mean(axis=0) - rotation @ a.mean(axis=0)
+        return start
+
+    axes = [np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2] for x in (a, b)]
+    rotations = []
+    for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        third = np.linalg.det(axes[1].T @ np.diag([*signs, 1.0]) @ axes[0])
+        rotations.append(axes[1].T @ np.diag([*signs, np.sign(third)]) @ axes[0])
+    near = [(misfit(np.eye(4)), np.eye(4)), improved(np.eye(4)), improved(shifted(np.eye(3)))]
+    best = min(near, key=lambda found: found[0])
+    turned = min((improved(shifted(r)) for r in rotations), key=lambda found: found[0])
+    return turned[1] if turned[0] < _MUCH_BETTER * best[0] else best[1]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from dine import __version__
 from dine.data.readers import read_surface
@@ -45,8 +46,8 @@ FEWEST = 16
 _LARGEST_RATIO = 3.0
 _UNITS = {1000: "metres and millimetres", 100: "metres and centimetres", 10: "cm and mm"}
 _UNITS |= {25.4: "inches and millimetres"}
-# A source point is shown by the target if a target point comes back to within so many spacings.
-_RETURN = 2.5
+# A source point is shown by the target if a target point ends up within so many spacings of it.
+_RETURN = 3.0
 
 
 @dataclass(frozen=True)
@@ -214,28 +215,24 @@ def register(
     samples = _draw(source, points, rng, "source")
     seen = _draw(target, points, rng, "target").carry(target.vertices)
     places = samples.carry(source.vertices)
-    matrix = _aligned(prealign, places, seen)
+    matrix = _aligned(prealign, places, seen, partial)
     frame = Frame.of(transformed(places, matrix))
     start = frame.normalise(transformed(places, matrix))
     order = convention_order(start, model.convention)
     samples, places, start = samples[order], places[order], start[order]
     goal = frame.normalise(seen)
     where = chosen_device(device)
-    found, spread = run_network(model.backbone, start, goal, where)
-    supported = np.ones(len(start), bool)
     notes: list[str] = []
     if partial:
-        supported = _supported(model.backbone, start, goal, where)
-        if supported.sum() < FEWEST:
-            raise DataError(
-                "Hardly any part of the source is found in the target; check that both show the "
-                "same object, or leave out `partial`."
+        found, spread, supported = _from_part(model.backbone, start, goal, where)
+        if not supported.all():
+            notes.append(
+                f"{100 * (~supported).mean():.0f} % of the source has no counterpart in the target "
+                "and follows the rest."
             )
-        found = carry(start[supported], found[supported], start)
-        notes += [
-            f"{100 * (~supported).mean():.0f} % of the source has no counterpart in the target and "
-            "follows the rest."
-        ] * bool((~supported).any())
+    else:
+        found, spread = run_network(model.backbone, start, goal, where)
+        supported = np.ones(len(start), bool)
     if map_steps:
         if model.prior is None:
             raise ConfigError("Refinement with a prior needs a prior; give one.")
@@ -431,23 +428,44 @@ def _check_sizes(source: Surface, target: Surface) -> None:
     )
 
 
-def _aligned(how: str | np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _aligned(
+    how: str | np.ndarray, source: np.ndarray, target: np.ndarray, partial: bool
+) -> np.ndarray:
     if not isinstance(how, str):
         return check_rigid(how)
     if how == "off":
         return np.eye(4)
     if how == "auto":
-        return rigid_alignment(source, target)
+        return rigid_alignment(source, target, partial=partial)
     raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
 
 
-def _supported(
+def _from_part(
     backbone: Any, start: np.ndarray, goal: np.ndarray, device: torch.device
-) -> np.ndarray:
-    """Which source points some target point comes back to when registered the other way round."""
-    back, _ = run_network(backbone, goal, start, device)
-    spacing = np.median(np.sort(np.linalg.norm(goal[:, None] - goal[None], axis=2), axis=1)[:, 1])
-    return distances(start, goal + back) < _RETURN * spacing
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """Displacement, spread and support (N,) of source points whose target is a part of them.
+
+    The part is registered to the whole, in which each of its points has a counterpart; the inverse
+    is known where they end up and carried from there.
+
+    Raises:
+        DataError: the part ends up beside the source.
+    """
+    frame = Frame.of(goal)
+    back, spread = run_network(backbone, frame.normalise(goal), frame.normalise(start), device)
+    back = back * frame.scale
+    places = goal + back
+    reach = _RETURN * float(np.median(cKDTree(start).query(start, k=2)[0][:, 1]))
+    supported = distances(start, places) < reach
+    if supported.sum() < FEWEST:
+        raise DataError(
+            "Hardly any part of the source is found in the target; check that both show the same "
+            "object, or leave out `partial`."
+        )
+    found = carry(places, -back, start)
+    if spread is not None:
+        spread = carry(places, spread[:, None] * frame.scale, start)[:, 0]
+    return found, spread, supported
 
 
 def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:

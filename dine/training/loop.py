@@ -200,7 +200,7 @@ def _train(
         weight_decay=settings.weight_decay,
         fused=True,
     )
-    batches = Batches(train_pairs, team.device, train_targets)
+    batches = Batches(train_pairs, team.device, train_targets, settings.parts)
     val_batches = Batches(val_pairs, team.device, val_targets)
     path = folder / STATE
     with one_writer(folder) if team.leads else contextlib.nullcontext():
