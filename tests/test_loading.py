@@ -81,3 +81,33 @@ def test_a_fault_in_the_thread_reaches_the_user():
     with pytest.raises(DataError, match="NaN"):
         next(stream)
     assert not loaders()
+
+
+def test_parts_are_pieces_of_the_source_in_their_own_frame():
+    pairs = toy_pairs()
+    batches = Batches(pairs, CPU, parts=1.0)
+    sizes = set()
+    for index in range(5):
+        batch, truth = batches.get([index], [(7, index)])
+        size = batch.source.shape[1]
+        sizes.add(size)
+        assert 0.29 * pairs.source.shape[1] <= size < pairs.source.shape[1]
+        assert batch.target.shape[1] == pairs.target.shape[1]
+        assert batch.source[0].norm(dim=1).max() == pytest.approx(1, abs=1e-5)
+        assert batch.source[0].mean(dim=0).abs().max() < 1e-5
+        # Every moved point is one of the target's.
+        moved = batch.source[0] + truth[0]
+        assert torch.cdist(moved.double(), batch.target[0].double()).amin(dim=1).max() < 1e-5
+        assert int(batch.graph.tail.max()) < size
+    assert len(sizes) > 1
+    whole, _ = Batches(pairs, CPU, parts=0.0).get([0], [(7, 0)])
+    assert whole.source.shape[1] == pairs.source.shape[1]
+
+
+def test_some_parts_share_a_batch_with_wholes():
+    pairs = toy_pairs()
+    batches = Batches(pairs, CPU, parts=0.5)
+    batch, truth = batches.get(range(5), [(8, index) for index in range(5)])
+    sizes = batch.source_mask.sum(dim=1)
+    assert sizes.min() < sizes.max() == pairs.source.shape[1]
+    assert (truth[~batch.source_mask] == 0).all()

@@ -114,7 +114,8 @@ def save(
             result.target,
             result.moved.vertices,
             scalars=scalars,
-            title=f"{result.source.name} → {result.target.name}",
+            units=dict.fromkeys(scalars, "in units of the files"),
+            title=f"{Path(result.source.name).name} → {Path(result.target.name).name}",
             facts=_facts(result),
             overwrite=overwrite,
         )
