@@ -142,7 +142,10 @@ def config_group():
 @config_group.command("check")
 @click.argument("files", nargs=-1, required=True, type=IN)
 def config_check(files: tuple[Path, ...]):
-    """Check configuration files; later ones are laid over earlier ones."""
+    """Check configuration files; later ones are laid over earlier ones.
+
+    Example: dine config check config.yaml my.yaml
+    """
     config.load(*files)
     click.echo("The configuration is valid.")
 
@@ -150,7 +153,10 @@ def config_check(files: tuple[Path, ...]):
 @config_group.command("show")
 @click.argument("files", nargs=-1, required=True, type=IN)
 def config_show(files: tuple[Path, ...]):
-    """Print the complete configuration, defaults included, as YAML."""
+    """Print the complete configuration, defaults included, as YAML.
+
+    Example: dine config show config.yaml my.yaml
+    """
     import yaml
 
     click.echo(yaml.safe_dump(config.load(*files).model_dump(), sort_keys=False), nl=False)
@@ -158,7 +164,10 @@ def config_show(files: tuple[Path, ...]):
 
 @config_group.command("schema")
 def config_schema():
-    """Print the JSON schema of the configuration."""
+    """Print the JSON schema of the configuration.
+
+    Example: dine config schema
+    """
     click.echo(json.dumps(config.Config.model_json_schema(), indent=2))
 
 
@@ -166,7 +175,10 @@ def config_schema():
 @click.argument("settings", type=Settings(config.Config))
 @click.option("--out", type=OUT, required=True, help="YAML to write.")
 def config_write(settings: config.Config, out: Path):
-    """Write a complete configuration, given as JSON or @FILE, as YAML."""
+    """Write a complete configuration, given as JSON or @FILE, as YAML.
+
+    Example: dine config write --settings @my.yaml --out complete.yaml
+    """
     import yaml
 
     write_text(out, yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False))
@@ -216,7 +228,10 @@ def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Pairs to write (HDF5).")
 def pairs(raw_file: Path, settings: config.Pairs, seed: int, out: Path):
-    """Turn raw meshes into index-consistent source/target pairs."""
+    """Turn raw meshes into index-consistent source/target pairs.
+
+    Example: dine pairs --raw mine/raw.json --out pairs.h5
+    """
     from dine.data.prepare import prepare_pairs
 
     prepare_pairs(raw_file, settings, seed=seed, out=out)
@@ -229,7 +244,10 @@ def pairs(raw_file: Path, settings: config.Pairs, seed: int, out: Path):
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Variant to write (HDF5).")
 def corrupt(pairs: Path, condition: str, level: float, seed: int, out: Path):
-    """Draw corrupted targets for the test split."""
+    """Draw corrupted targets for the test split.
+
+    Example: dine corrupt --pairs pairs.h5 --condition noise --level 0.03 --out noise.h5
+    """
     from dine.data.pairs import make_variant, read_pairs, write_variant
 
     test = read_pairs(pairs, split="test")
@@ -242,7 +260,10 @@ def corrupt(pairs: Path, condition: str, level: float, seed: int, out: Path):
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Targets to write (HDF5).")
 def resample(raw_file: Path, pairs: Path, seed: int, out: Path):
-    """Draw the points of all targets anew, as two scans of one object never share points."""
+    """Draw the points of all targets anew, as two scans of one object never share points.
+
+    Example: dine resample --raw mine/raw.json --pairs pairs.h5 --out resampled.h5
+    """
     from dine.data.prepare import resample_targets
 
     resample_targets(raw_file, pairs, seed=seed, out=out)
@@ -253,7 +274,10 @@ def resample(raw_file: Path, pairs: Path, seed: int, out: Path):
 @click.option("--out", type=OUT, required=True, help="Result (JSON).")
 @seed_option
 def agreement(pairs: Path, seed: int, out: Path):
-    """Measure how well the index convention holds across objects."""
+    """Measure how well the index convention holds across objects.
+
+    Example: dine agreement --pairs pairs.h5 --out agreement.json
+    """
     from dine.data.prepare import measure_agreement
 
     write_json(out, measure_agreement(pairs, seed=seed))
@@ -308,7 +332,10 @@ def stage1(pairs, backbone, settings, seed, compute, name, out):
 @training_options
 @click.option("--out", type=FOLDER, required=True, help="Run folder.")
 def pretrain(pairs, targets, backbone, settings, seed, compute, out):
-    """Train weights to start Stage 1 from, on synthetic pairs with known displacement."""
+    """Train weights to start Stage 1 from, on synthetic pairs with known displacement.
+
+    Example: dine pretrain --pairs pairs.h5 --targets resampled.h5 --out runs/pretraining
+    """
     from dine.training import stages
 
     _start_torch()
@@ -333,7 +360,10 @@ def pretrain(pairs, targets, backbone, settings, seed, compute, out):
 @name_option
 @click.option("--out", type=OUT, required=True, help="Fields to write (HDF5).")
 def fields(model, pairs, targets, batch_size, compute, name, out):
-    """Write a model's displacement fields of the training split."""
+    """Write a model's displacement fields of the training split.
+
+    Example: dine fields --model model.safetensors --pairs pairs.h5 --out dvf.h5
+    """
     from dine.training import stages
 
     _start_torch()
@@ -384,7 +414,11 @@ stage2_option = click.option(
 @training_options
 @click.option("--out", type=OUT, required=True, help="Result (JSON).")
 def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute, out):
-    """Choose λ on validation pairs."""
+    """Choose λ on validation pairs.
+
+    Example: dine search-lambda --pairs pairs.h5 --model model.safetensors --prior pca
+    pca.safetensors --out lambda.json
+    """
     from dine.training import stages
 
     _start_torch()
@@ -405,7 +439,11 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute
 @name_option
 @click.option("--out", type=FOLDER, required=True, help="Run folder.")
 def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, out):
-    """Refine a Stage-1 model with λ times a frozen prior; without a prior, the λ = 0 control."""
+    """Refine a Stage-1 model with λ times a frozen prior; without a prior, the λ = 0 control.
+
+    Example: dine stage2 --pairs pairs.h5 --model model.safetensors --variant pca --prior
+    pca.safetensors --lambda lambda.json --out runs/pca
+    """
     from dine.training import stages
 
     _start_torch()
@@ -444,7 +482,10 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, 
 @name_option
 @click.option("--out", type=OUT, required=True, help="Predictions to write (HDF5).")
 def predict(model, pairs, variants, batch_size, compute, name, out):
-    """Register the test split and its corrupted variants; write the displacement fields."""
+    """Register the test split and its corrupted variants; write the displacement fields.
+
+    Example: dine predict --model model.safetensors --pairs pairs.h5 --out predictions.h5
+    """
     from dine.evaluation.predict import predict as run
 
     _start_torch()
@@ -469,7 +510,11 @@ def predict(model, pairs, variants, batch_size, compute, name, out):
 @click.option("--point-errors", type=OUT, required=True, help="Per-point errors (HDF5).")
 @click.option("--out", type=OUT, required=True, help="Metrics (CSV).")
 def evaluate(predictions, pairs, variants, dataset, backbone, method, point_errors, out):
-    """Compute metrics from stored predictions."""
+    """Compute metrics from stored predictions.
+
+    Example: dine evaluate --predictions predictions.h5 --pairs pairs.h5 --dataset mine
+    --backbone robust_defreg --method stage1 --point-errors errors.h5 --out metrics.csv
+    """
     from dine.evaluation.metrics import evaluate as run
 
     run(
@@ -488,7 +533,10 @@ def evaluate(predictions, pairs, variants, dataset, backbone, method, point_erro
 @click.argument("metrics", nargs=-1, required=True, type=IN)
 @click.option("--out", type=FOLDER, required=True, help="Folder for CSV, Markdown and LaTeX.")
 def tables(metrics, out):
-    """Aggregate metrics into the paper's tables and their companions."""
+    """Aggregate metrics into the paper's tables and their companions.
+
+    Example: dine tables a/metrics.csv b/metrics.csv --out tables
+    """
     from dine.reporting.tables import all_tables, load_metrics, to_markdown, write_table
 
     made = all_tables(load_metrics(metrics))
@@ -502,7 +550,10 @@ def tables(metrics, out):
 @settings_option(config.Config)
 @click.option("--out", type=FOLDER, required=True, help="Folder for PNG and PDF.")
 def figures(results, settings, out):
-    """Draw all figures of a finished run."""
+    """Draw all figures of a finished run.
+
+    Example: dine figures --results results --settings @config.yaml --out results/figures
+    """
     from dine.reporting.build import draw_figures
 
     draw_figures(results, settings, out)
@@ -513,7 +564,10 @@ def figures(results, settings, out):
 @settings_option(config.Config)
 @click.option("--out", type=OUT, required=True, help="Report to write (HTML).")
 def report(results, settings, out):
-    """Write one self-contained HTML page with tables, figures and findings."""
+    """Write one self-contained HTML page with tables, figures and findings.
+
+    Example: dine report --results results --settings @config.yaml --out results/report.html
+    """
     from dine.reporting.build import build_report
 
     build_report(results, settings, out)
@@ -724,7 +778,11 @@ def register_many(
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto")
 @click.option("--out", type=OUT, required=True, help="Calibration to write (JSON, and a plot).")
 def calibrate(model, pairs, targets, prior, device, out):
-    """Learn from validation pairs what a model's uncertainty means; check it on test pairs."""
+    """Learn from validation pairs what a model's uncertainty means; check it on test pairs.
+
+    Example: dine calibrate --model model.safetensors --pairs pairs.h5 --prior
+    pca.safetensors --out calibration.json
+    """
     from dine.registration.calibration import calibrate as run
     from dine.training.parallel import chosen_device
 
