@@ -177,7 +177,7 @@ def config_schema():
 def config_write(settings: config.Config, out: Path):
     """Write a complete configuration, given as JSON or @FILE, as YAML.
 
-    Example: dine config write --settings @my.yaml --out complete.yaml
+    Example: dine config write @my.yaml --out complete.yaml
     """
     import yaml
 

@@ -9,7 +9,6 @@ import pytest
 
 from dine import cli
 
-
 CONFIG = Path(__file__).resolve().parents[1] / "config.yaml"
 
 
