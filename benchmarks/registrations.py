@@ -1,6 +1,6 @@
 """Register known deformations of real meshes, and real deformed pairs; print one table.
 
-    python benchmarks/registrations.py ../shared/meshes [--backbone deftransnet] [--map 60]
+    python benchmarks/registrations.py ../shared/meshes [--backbone deftransnet] [--map 0]
 
 Every mesh of ``objects`` is registered to a copy that the published recipe deforms (a synthetic
 deformation of a real shape); in ``pairs``, meshes of one folder with equal faces are registered to
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("meshes", type=Path)
     parser.add_argument("--backbone", default="robust_defreg")
     parser.add_argument("--weights", type=Path)
-    parser.add_argument("--map", type=int, default=0, dest="map_steps")
+    parser.add_argument("--map", type=int, default=20, dest="rounds")
     parser.add_argument("--prealign", default="auto")
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
@@ -85,7 +85,7 @@ def main() -> None:
                 source,
                 target,
                 model=model,
-                map_steps=arguments.map_steps,
+                rounds=arguments.rounds,
                 partial="partial" in name,
                 prealign=arguments.prealign,
             )

@@ -594,7 +594,7 @@ def model_options(command):
         click.option(
             "--calibration", type=IN, help="Of other weights than the shipped ones; `calibrate`."
         ),
-        click.option("--prior", type=IN, help="A fitted prior, for the trust score and --map."),
+        click.option("--prior", type=IN, help="A fitted prior, for the trust score."),
         click.option("--weights", type=IN, help="Weights of ours or of the backbones' authors."),
         click.option("--backbone", default="robust_defreg", help="Shipped weights to use."),
         click.option("--precision", type=click.Choice(["float32", "bf16"]), default="float32"),
@@ -614,12 +614,10 @@ def registration_options(command):
         click.option("--partial", is_flag=True, help="The target shows a part of the source only."),
         click.option(
             "--map",
-            "map_steps",
-            type=click.IntRange(1),
-            is_flag=False,
-            flag_value=60,
-            default=None,
-            help="Refine with the prior, in so many steps (60).",
+            "rounds",
+            type=click.IntRange(0),
+            default=20,
+            help="Rounds of refinement at test time; 0 for the network's own field.",
         ),
         click.option(
             "--prealign",
@@ -673,7 +671,7 @@ def register(
     apply,
     landmarks,
     prealign,
-    map_steps,
+    rounds,
     partial,
     points,
     seed,
@@ -704,7 +702,7 @@ def register(
         prealign=_alignment(prealign),
         apply=shapes,
         landmarks=tuple(marks) if marks else None,
-        map_steps=map_steps or 0,
+        rounds=rounds,
         partial=partial,
         points=points,
         seed=seed,
@@ -742,7 +740,7 @@ def register(
 @registration_options
 @model_options
 def register_many(
-    manifest, out, suffix, prealign, map_steps, partial, points, seed, view, load_model, device
+    manifest, out, suffix, prealign, rounds, partial, points, seed, view, load_model, device
 ):
     """Register every pair of MANIFEST, a CSV file (source, target, name) or a folder.
 
@@ -755,7 +753,7 @@ def register_many(
     _start_torch()
     settings = {
         "prealign": _alignment(prealign),
-        "map_steps": map_steps or 0,
+        "rounds": rounds,
         "partial": partial,
         "points": points,
         "seed": seed,

@@ -47,7 +47,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "training": ("training",),
     "evaluation": ("evaluation",),
     "reporting": ("reporting",),
-    "calibration": ("registration/calibration.py", "registration/quality.py"),
+    "calibration": (
+        "registration/calibration.py",
+        "registration/quality.py",
+        "registration/refine.py",
+    ),
     "registration": ("registration",),
 }
 

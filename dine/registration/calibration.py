@@ -19,10 +19,14 @@ from dine.models.checkpoint import load_backbone
 from dine.priors import Prior, load_prior
 from dine.progress import Progress
 from dine.registration.quality import fit, folding
+from dine.registration.refine import ROUNDS, refine
 
 CALIBRATION_FORMAT = "dine-calibration"
 _BINS = 20
 _LIKELY = 90
+# Standard deviations to refine with: at the least, and of a backbone without marginals.
+_LEAST_ERROR = 0.03
+_UNKNOWN = 0.05
 
 
 @dataclass(frozen=True)
@@ -99,18 +103,31 @@ def plausibility(prior: Prior, displacement: np.ndarray) -> dict[str, float] | N
 
 
 @torch.no_grad()
-def run_network(
-    backbone: Backbone, source: np.ndarray, target: np.ndarray, device: torch.device
+def find_field(
+    backbone: Backbone,
+    source: np.ndarray,
+    target: np.ndarray,
+    device: torch.device,
+    rounds: int = ROUNDS,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Displacement (N, 3) and, where the backbone has marginals, their spread (N,), float64."""
+    """Displacement (N, 3) and, where the backbone has marginals, their spread (N,), float64.
+
+    The network's field, refined in some rounds (see :func:`~dine.registration.refine.refine`); 0
+    leaves it as it is.
+    """
     batch = make_batch([source], [target]).to(device)
     result = backbone.to(device).eval()(batch)
     found = result.displacement[0].double().cpu().numpy()
     if result.belief is None:
-        return found, None
+        error = np.full(len(found), _UNKNOWN)
+        return (refine(source, target, found, error, rounds=rounds) if rounds else found), None
     temperature = backbone.arguments.get("temperature", 50.0)
     variance = marginal_variance(result.candidates, result.belief, result.displacement, temperature)
-    return found, variance[0].double().clamp_min(0).sqrt().cpu().numpy()
+    spread = variance[0].double().clamp_min(0).sqrt().cpu().numpy()
+    if rounds:
+        error = np.maximum(spread, _LEAST_ERROR)
+        found = refine(source, target, found, error, rounds=rounds)
+    return found, spread
 
 
 def _measure(
@@ -128,7 +145,7 @@ def _measure(
             source, target = (x[i].astype(np.float64) for x in (pairs.source, pairs.target))
             goal = target if seen is None else seen[i].astype(np.float64)
             goal = goal[np.random.default_rng([3, i]).permutation(len(goal))]
-            found, spread = run_network(backbone, source, goal, device)
+            found, spread = find_field(backbone, source, goal, device)
             if spread is None:
                 raise DataError("This backbone has no marginals; it cannot be calibrated.")
             moved = source + found

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from dine.errors import DataError
 
-# Starts at other rotations must fit this much better, or symmetric objects would be turned.
+# A rigid motion must lower the mean squared distance this much, or deformations of round objects
+# would pass for rotations; so must starts at other rotations, or symmetric objects would be turned.
 _MUCH_BETTER = 0.5
 _ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
 
@@ -76,7 +77,8 @@ def rigid_alignment(source: np.ndarray, target: np.ndarray, *, partial: bool = F
 
     Iterative closest points (trimesh) from where the points are, from coinciding middles, and from
     coinciding principal axes; the last are taken only if they fit much better, since a symmetric
-    object fits about as well the wrong way round. The identity is kept where nothing fits better.
+    object fits about as well the wrong way round. The identity is kept unless something fits much
+    better.
 
     With ``partial`` the target is brought onto the source, of which it is a part, and the inverse
     is returned: every point of the part has a counterpart in the whole, but not the other way.
@@ -109,7 +111,11 @@ def _alignment(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray:
     for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         third = np.linalg.det(axes[1].T @ np.diag([*signs, 1.0]) @ axes[0])
         rotations.append(axes[1].T @ np.diag([*signs, np.sign(third)]) @ axes[0])
-    near = [(misfit(np.eye(4)), np.eye(4)), improved(np.eye(4)), improved(shifted(np.eye(3)))]
-    best = min(near, key=lambda found: found[0])
+    best = (misfit(np.eye(4)), np.eye(4))
+    near = min(
+        (improved(start) for start in (np.eye(4), shifted(np.eye(3)))), key=lambda found: found[0]
+    )
+    if near[0] < _MUCH_BETTER * best[0]:
+        best = near
     turned = min((improved(shifted(r)) for r in rotations), key=lambda found: found[0])
     return turned[1] if turned[0] < _MUCH_BETTER * best[0] else best[1]

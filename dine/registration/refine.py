@@ -1,56 +1,139 @@
-"""Refining one field at test time: maximum a posteriori by gradient descent."""
+"""Refining one field at test time: the most probable smooth field, by expectation–maximisation.
+
+The network's field is taken as a noisy observation of the true one, and the true one as drawn from
+a Gaussian process: nearby points move alike, at two scales, on top of an affine motion. Expectation
+assigns target points to moved source points softly, with a share of outliers (as in coherent point
+drift; Myronenko and Song, 2010); maximisation is one linear solve, in which every point is observed
+twice: by the network, and by the targets assigned to it. Two more starts trust the network less,
+which guards against one that is mistaken as a whole; the most probable result is kept.
+"""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+from threadpoolctl import threadpool_limits
 
-from dine.geometry.chamfer import nearest_squared
-from dine.geometry.graph import neighbour_graph
-from dine.priors import Prior
+ROUNDS = 20
 
-_RATE = 5e-3
-_NEIGHBOURS = 10
+# In the normalised frame: widths and standard deviations of the process, and of the affine part:
+# the best of eight choices on twelve validation pairs of the pretraining data with resampled
+# targets. On eighteen, the mean correspondence error of Robust-DefReg's fields is 0.155; refined
+# with the network's field as an observation 0.129, started from it alone 0.113, started from no
+# displacement 0.102, the most probable of the three 0.100.
+_WIDTHS = (1.5, 0.4)
+_AMPLITUDES = (0.5, 0.04)
+_AFFINE = 0.5
+_OUTLIERS = 0.1
+_LEAST_SIGMA = 0.01
+_BOX = 8.0
+
+
+def covariance(points: np.ndarray) -> np.ndarray:
+    """(N, N) covariance of one coordinate of the displacement at (N, 3) points."""
+    squared = cdist(points, points, "sqeuclidean")
+    total = _AFFINE**2 * (points @ points.T + 1)
+    for width, amplitude in zip(_WIDTHS, _AMPLITUDES, strict=True):
+        total += amplitude**2 * np.exp(squared / (-2 * width**2))
+    return total
+
+
+def _posterior(prior: np.ndarray, value: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Mean of the process at its points, given values (N, 3) of some precision (N,) there."""
+    # With the roots of the precisions outside, points that are not observed do no harm.
+    root = np.sqrt(precision)
+    system = root[:, None] * prior * root
+    system[np.diag_indices_from(system)] += 1
+    factor = cho_factor(system, lower=True, overwrite_a=True, check_finite=False)
+    return prior @ (root[:, None] * cho_solve(factor, root[:, None] * value, check_finite=False))
 
 
 def refine(
     source: np.ndarray,
     target: np.ndarray,
     displacement: np.ndarray,
-    prior: Prior,
+    error: np.ndarray,
     *,
-    steps: int,
-    supported: np.ndarray,
-    device: torch.device,
-    prior_weight: float = 1e-5,
-    smoothness: float = 0.5,
+    rounds: int = ROUNDS,
+    part: bool = False,
 ) -> np.ndarray:
-    """Minimise Chamfer distance + weight · prior penalty + smoothness over the field (N, 3).
+    """The field (N, 3) after some rounds of expectation–maximisation, all in the normalised frame.
 
-    A penalty such as PCA's leaves free what lies outside its span, and the Chamfer distance alone
-    would tear neighbours apart there; so does nothing that differs between neighbours: the
-    smoothness is the mean squared difference of the change to the network's field along the
-    source's neighbour graph. Points that are not ``supported`` (N,) do not count in the distance.
-    A prior fitted to another number of points is left out.
+    Args:
+        source: (N, 3) points.
+        target: (M, 3) points.
+        displacement: (N, 3) of the network.
+        error: (N,) its expected errors, or standard deviations.
+        rounds: of expectation and maximisation; with 0 the network's field is smoothed only.
+        part: the source is a part of what the target shows. Every source point then looks for
+            targets; otherwise every target looks for source points, which would stretch the part.
     """
-    start = torch.as_tensor(displacement, dtype=torch.float32, device=device)[None]
-    x = torch.as_tensor(source, dtype=torch.float32, device=device)[None]
-    y = torch.as_tensor(target, dtype=torch.float32, device=device)[None]
-    mask = torch.as_tensor(supported, device=device)[None]
-    graph = neighbour_graph(source, _NEIGHBOURS).to(device)
-    fits = prior.shape.get("points") in (None, len(source))
-    prior = prior.to(device)
-    change = torch.zeros_like(start, requires_grad=True)
-    optimiser = torch.optim.Adam([change], lr=_RATE)
-    for _ in range(steps):
-        field = start + change
-        from_source, from_target = nearest_squared(x + field, y, mask)
-        loss = from_source.sum() / mask.sum() + from_target.mean()
-        differences = change[0, graph.tail] - change[0, graph.head]
-        loss = loss + smoothness * differences.square().sum(-1).mean()
-        if fits:
-            loss = loss + prior_weight * prior.penalty(field).mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    return (start + change)[0].detach().double().cpu().numpy()
+    # Small systems, for which many threads only wait for each other.
+    with threadpool_limits(1, user_api="blas"):
+        return _refine(source, target, displacement, error, rounds, int(part))
+
+
+def _refine(
+    source: np.ndarray,
+    target: np.ndarray,
+    displacement: np.ndarray,
+    error: np.ndarray,
+    rounds: int,
+    axis: int,
+) -> np.ndarray:
+    prior = covariance(source)
+    # Neighbours err alike, so a point says less about the process than its own error suggests.
+    precision = 1 / np.maximum(2 * error, 0.02) ** 2
+    start = _posterior(prior, displacement, precision)
+    if rounds == 0:
+        return start
+    # The network may be mistaken as a whole, as on parts or on objects unlike its training data.
+    nothing, silent = np.zeros_like(start), np.zeros_like(precision)
+    starts = [
+        (start, displacement, precision),
+        (start, nothing, silent),
+        (nothing, nothing, silent),
+    ]
+    found = [_rounds(source, target, prior, *each, rounds, axis) for each in starts]
+    return min(found, key=lambda x: x[1])[0]
+
+
+def _rounds(
+    source: np.ndarray,
+    target: np.ndarray,
+    prior: np.ndarray,
+    field: np.ndarray,
+    observed: np.ndarray,
+    observed_precision: np.ndarray,
+    rounds: int,
+    axis: int,
+) -> tuple[np.ndarray, float]:
+    """The field (N, 3) from one start, and its negative log posterior without the network.
+
+    ``axis`` 0 shares every target out among source points, 1 every source point among targets.
+    """
+    squared = cdist(source + field, target, "sqeuclidean")
+    variance = max(float(np.minimum(squared.min(axis=axis), 0.1).mean()), _LEAST_SIGMA**2)
+    outlier = _OUTLIERS / _BOX
+    for number in range(rounds + 1):
+        density = np.exp(squared / (-2 * variance)) * (
+            (1 - _OUTLIERS) / squared.shape[axis] / (2 * np.pi * variance) ** 1.5
+        )
+        likelihood = density.sum(axis=axis, keepdims=True) + outlier
+        if number == rounds:
+            break
+        weight = density / likelihood
+        mass = weight.sum(axis=1)
+        pulled = weight @ target - mass[:, None] * source
+        precision = np.maximum(mass / variance + observed_precision, 1e-9)
+        value = (pulled / variance + observed_precision[:, None] * observed) / precision[:, None]
+        field = _posterior(prior, value, precision)
+        squared = cdist(source + field, target, "sqeuclidean")
+        variance = max(
+            float((weight * squared).sum() / (3 * max(mass.sum(), 1e-9))), _LEAST_SIGMA**2
+        )
+    # Posterior means lie in the span of the covariance, where a little noise changes little.
+    noisy = prior + 1e-4 * np.eye(len(prior))
+    energy = 0.5 * float((field * cho_solve(cho_factor(noisy, lower=True), field)).sum())
+    return field, energy - float(np.log(likelihood).sum())

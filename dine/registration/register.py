@@ -23,14 +23,14 @@ from dine.models.checkpoint import load_backbone
 from dine.priors import load_prior
 from dine.registration.calibration import (
     Calibration,
+    find_field,
     load_calibration,
     plausibility,
-    run_network,
 )
 from dine.registration.carry import carry
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
 from dine.registration.quality import distances, fit, folding, landmark_errors
-from dine.registration.refine import refine
+from dine.registration.refine import ROUNDS, refine
 from dine.registration.trust import Trust, assess
 from dine.training.parallel import chosen_device
 from dine.training.stages import WEIGHTS, shipped_weights
@@ -177,7 +177,7 @@ def register(
     prealign: str | np.ndarray = "auto",
     apply: Mapping[str, Shape] | None = None,
     landmarks: tuple[np.ndarray, np.ndarray] | None = None,
-    map_steps: int = 0,
+    rounds: int = ROUNDS,
     partial: bool = False,
     points: int = POINTS,
     seed: int = 0,
@@ -196,7 +196,7 @@ def register(
             brings the source to the target.
         apply: further shapes in the source's frame to move along, by name.
         landmarks: corresponding (L, 3) points of source and target, to measure with only.
-        map_steps: steps of refinement at test time with the prior; 0 for none.
+        rounds: of refinement at test time (most probable smooth field); 0 for the network's own.
         partial: the target shows a part of the source only. Regions without counterpart follow the
             others instead of being pulled onto the part.
         points: points that the network sees; it was trained with 1024.
@@ -223,22 +223,18 @@ def register(
     goal = frame.normalise(seen)
     where = chosen_device(device)
     notes: list[str] = []
+    if rounds < 0:
+        raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
     if partial:
-        found, spread, supported = _from_part(model.backbone, start, goal, where)
+        found, spread, supported = _from_part(model.backbone, start, goal, where, rounds)
         if not supported.all():
             notes.append(
                 f"{100 * (~supported).mean():.0f} % of the source has no counterpart in the target "
                 "and follows the rest."
             )
     else:
-        found, spread = run_network(model.backbone, start, goal, where)
+        found, spread = find_field(model.backbone, start, goal, where, rounds)
         supported = np.ones(len(start), bool)
-    if map_steps:
-        if model.prior is None:
-            raise ConfigError("Refinement with a prior needs a prior; give one.")
-        found = refine(
-            start, goal, found, model.prior, steps=map_steps, supported=supported, device=where
-        )
     return _result(
         began,
         model,
@@ -256,7 +252,7 @@ def register(
         landmarks,
         tuple(notes),
         {
-            "map_steps": map_steps,
+            "rounds": rounds,
             "partial": partial,
             "points": len(start),
             "seed": seed,
@@ -441,7 +437,7 @@ def _aligned(
 
 
 def _from_part(
-    backbone: Any, start: np.ndarray, goal: np.ndarray, device: torch.device
+    backbone: Any, start: np.ndarray, goal: np.ndarray, device: torch.device, rounds: int
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """Displacement, spread and support (N,) of source points whose target is a part of them.
 
@@ -452,7 +448,11 @@ def _from_part(
         DataError: the part ends up beside the source.
     """
     frame = Frame.of(goal)
-    back, spread = run_network(backbone, frame.normalise(goal), frame.normalise(start), device)
+    part, whole = frame.normalise(goal), frame.normalise(start)
+    back = refine(
+        part, whole, np.zeros_like(part), np.full(len(part), 0.3), rounds=rounds, part=True
+    )
+    spread = None
     back = back * frame.scale
     places = goal + back
     reach = _RETURN * float(np.median(cKDTree(start).query(start, k=2)[0][:, 1]))
