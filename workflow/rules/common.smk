@@ -127,3 +127,11 @@ def stage2_outputs(variant):
 
 def variant_options(wildcards, input):
     return options("--variant", input.variants)
+
+
+def calibrating_prior(wildcards):
+    """The backbone's first PCA prior, if any: what the trust score measures fields with."""
+    return [
+        FILES.prior(wildcards.dataset, wildcards.backbone, prior)
+        for prior in pca_priors(CONFIG, wildcards.backbone)[:1]
+    ]

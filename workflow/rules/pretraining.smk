@@ -171,8 +171,8 @@ rule pretraining_calibration:
         targets=expand(rules.pretraining_targets.output, shape=LEVELS),
         prior=rules.pretraining_prior.output,
     output:
-        PRETRAINING / "{backbone}" / "calibration.json",
-        PRETRAINING / "{backbone}" / "calibration.png",
+        calibration=PRETRAINING / "{backbone}" / "calibration.json",
+        plot=PRETRAINING / "{backbone}" / "calibration.png",
     log:
         LOGS / "pretraining" / "{backbone}_calibration.log",
     conda:
@@ -188,7 +188,7 @@ rule pretraining_calibration:
     shell:
         "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
         " {params.pairs} {params.targets} --prior {input.prior:q} --device {params.device}"
-        " --out {output[0]:q}"
+        " --out {output.calibration:q}"
 
 
 rule pretrained:

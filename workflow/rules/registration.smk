@@ -1,22 +1,14 @@
 # What `dine register` needs beside a trained model; `snakemake -j2 calibrations`. Not part of `all`.
 
 
-def calibrating_prior(wildcards):
-    """The backbone's first PCA prior, if any: what the trust score measures fields with."""
-    return [
-        FILES.prior(wildcards.dataset, wildcards.backbone, prior)
-        for prior in pca_priors(CONFIG, wildcards.backbone)[:1]
-    ]
-
-
 rule calibrate:
     input:
         model=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "model.safetensors",
         pairs=rules.pairs.output,
         prior=calibrating_prior,
     output:
-        RESULTS / "{dataset}" / "{backbone}" / "{run}" / "calibration.json",
-        RESULTS / "{dataset}" / "{backbone}" / "{run}" / "calibration.png",
+        calibration=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "calibration.json",
+        plot=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "calibration.png",
     log:
         LOGS / "{dataset}" / "{backbone}" / "{run}" / "calibrate.log",
     conda:
@@ -31,7 +23,7 @@ rule calibrate:
     shell:
         "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
         " --pairs {input.pairs:q} {params.prior} --device {params.device}"
-        " --out {output[0]:q}"
+        " --out {output.calibration:q}"
 
 
 rule calibrations:
