@@ -596,7 +596,7 @@ def model_options(command):
         ),
         click.option("--prior", type=IN, help="A fitted prior, for the trust score."),
         click.option("--weights", type=IN, help="Weights of ours or of the backbones' authors."),
-        click.option("--backbone", default="robust_defreg", help="Shipped weights to use."),
+        click.option("--backbone", help="Shipped weights to use; by default robust_defreg."),
         click.option("--precision", type=click.Choice(["float32", "bf16"]), default="float32"),
         click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto"),
     ):

@@ -339,7 +339,7 @@ def test_weights_must_fit(tmp_path):
     other = tmp_path / "w.safetensors"
     save_backbone(other, BACKBONES.get("deftransnet")())
     with pytest.raises(ConfigError, match="holds weights of deftransnet"):
-        load_model("robust_defreg_of_mine", weights=other)
+        load_model("robust_defreg", weights=other)
     assert load_model(weights=other).backbone.registered_name == "deftransnet"
     other.write_bytes(b"nothing")
     with pytest.raises(CheckpointError):
@@ -350,8 +350,29 @@ def test_weights_must_fit(tmp_path):
 
 def test_a_calibration_of_other_weights_is_refused(tmp_path):
     calibration(model="another").save(tmp_path / "c.json")
-    with pytest.raises(DataError, match="other weights"):
+    with pytest.raises(DataError, match="another model"):
         load_model(calibration=tmp_path / "c.json")
+
+
+def test_a_calibration_with_another_prior_is_refused(tmp_path):
+    other = tmp_path / "prior.safetensors"
+    PCAPrior.fit(np.random.default_rng(11).normal(size=(4, 1024, 3))).save(other)
+    with pytest.raises(DataError, match="another prior"):
+        load_model(prior=other)
+
+
+def test_a_calibration_counts_only_where_it_applies(pair, result):
+    assert result.trust.expected_error > 0
+    assert "in_span" in result.trust.percentiles
+    for settings in ({"rounds": 3}, {"partial": True}):
+        found = dine.register(*pair, points=POINTS, **settings)
+        assert found.trust.expected_error is None
+        assert found.uncertainty is None
+        assert not found.trust.percentiles
+        assert "no calibration" in " ".join(found.trust.reasons)
+    # Without one the prior's order of points is not known, so nothing is measured with it.
+    other = dine.register(*pair, points=POINTS, model=load_model("deftransnet"))
+    assert "in_span" not in other.report["normalised"]
 
 
 # --- commands -------------------------------------------------------------------------------------

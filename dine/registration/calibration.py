@@ -221,6 +221,7 @@ def calibrate(
         points=pairs.source.shape[1],
         origin=str(pairs.attributes.get("origin", "unknown")),
         resampled=bool(targets),
+        rounds=ROUNDS,
         validation_pairs=len(measured["val"][2]["initial"]),
         test_pairs=len(measured["test"][2]["initial"]),
         test_inside_likely=inside,

@@ -10,6 +10,8 @@ which guards against one that is mistaken as a whole; the most probable result i
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
@@ -28,6 +30,11 @@ _AFFINE = 0.5
 _OUTLIERS = 0.1
 _LEAST_SIGMA = 0.01
 _BOX = 8.0
+
+
+class _Result(NamedTuple):
+    field: np.ndarray
+    log_likelihood: float
 
 
 def covariance(points: np.ndarray) -> np.ndarray:
@@ -52,8 +59,8 @@ def _posterior(prior: np.ndarray, value: np.ndarray, precision: np.ndarray) -> n
 def refine(
     source: np.ndarray,
     target: np.ndarray,
-    displacement: np.ndarray,
-    error: np.ndarray,
+    displacement: np.ndarray | None,
+    error: np.ndarray | None,
     *,
     rounds: int = ROUNDS,
     part: bool = False,
@@ -63,8 +70,8 @@ def refine(
     Args:
         source: (N, 3) points.
         target: (M, 3) points.
-        displacement: (N, 3) of the network.
-        error: (N,) its expected errors, or standard deviations.
+        displacement: (N, 3) of the network, or None to start from no displacement alone.
+        error: (N,) its expected errors, or standard deviations; None likewise.
         rounds: of expectation and maximisation; with 0 the network's field is smoothed only.
         part: the source is a part of what the target shows. Every source point then looks for
             targets; otherwise every target looks for source points, which would stretch the part.
@@ -77,26 +84,35 @@ def refine(
 def _refine(
     source: np.ndarray,
     target: np.ndarray,
-    displacement: np.ndarray,
-    error: np.ndarray,
+    displacement: np.ndarray | None,
+    error: np.ndarray | None,
     rounds: int,
     axis: int,
 ) -> np.ndarray:
     prior = covariance(source)
+    nothing, silent = np.zeros_like(source), np.zeros(len(source))
+    if displacement is None:
+        return _rounds(source, target, prior, nothing, nothing, silent, rounds, axis).field
     # Neighbours err alike, so a point says less about the process than its own error suggests.
     precision = 1 / np.maximum(2 * error, 0.02) ** 2
     start = _posterior(prior, displacement, precision)
     if rounds == 0:
         return start
-    # The network may be mistaken as a whole, as on parts or on objects unlike its training data.
-    nothing, silent = np.zeros_like(start), np.zeros_like(precision)
+    # The network may be mistaken as a whole, as on objects unlike its training data.
     starts = [
         (start, displacement, precision),
         (start, nothing, silent),
         (nothing, nothing, silent),
     ]
     found = [_rounds(source, target, prior, *each, rounds, axis) for each in starts]
-    return min(found, key=lambda x: x[1])[0]
+    # Posterior means lie in the span of the covariance, where a little noise changes little.
+    factor = cho_factor(prior + 1e-4 * np.eye(len(prior)), lower=True)
+
+    def improbability(result: _Result) -> float:
+        energy = 0.5 * float((result.field * cho_solve(factor, result.field)).sum())
+        return energy - result.log_likelihood
+
+    return min(found, key=improbability).field
 
 
 def _rounds(
@@ -108,8 +124,8 @@ def _rounds(
     observed_precision: np.ndarray,
     rounds: int,
     axis: int,
-) -> tuple[np.ndarray, float]:
-    """The field (N, 3) from one start, and its negative log posterior without the network.
+) -> _Result:
+    """The field from one start, and how well it explains the targets, whatever the network says.
 
     ``axis`` 0 shares every target out among source points, 1 every source point among targets.
     """
@@ -133,7 +149,4 @@ def _rounds(
         variance = max(
             float((weight * squared).sum() / (3 * max(mass.sum(), 1e-9))), _LEAST_SIGMA**2
         )
-    # Posterior means lie in the span of the covariance, where a little noise changes little.
-    noisy = prior + 1e-4 * np.eye(len(prior))
-    energy = 0.5 * float((field * cho_solve(cho_factor(noisy, lower=True), field)).sum())
-    return field, energy - float(np.log(likelihood).sum())
+    return _Result(field, float(np.log(likelihood).sum()))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from dine import __version__
@@ -68,7 +67,7 @@ class Model:
 
 
 def load_model(
-    backbone: str = "robust_defreg",
+    backbone: str | None = None,
     *,
     weights: str | Path | None = None,
     prior: str | Path | None = None,
@@ -77,7 +76,8 @@ def load_model(
     """Weights, prior and calibration, by name or from files.
 
     Args:
-        backbone: a backbone with shipped weights; must fit ``weights`` where these are given.
+        backbone: a backbone with shipped weights, by default ``robust_defreg``; must fit
+            ``weights`` where these are given.
         weights: a file of weights, ours or as published by the authors of the backbones.
         prior: a file of a fitted prior; by default the shipped one with the shipped weights.
         calibration: a file of ``dine calibrate``, likewise.
@@ -88,9 +88,11 @@ def load_model(
         DataError: the calibration was made with other weights or another prior.
     """
     shipped = weights is None
+    if shipped:
+        backbone = backbone or "robust_defreg"
     path = shipped_weights(backbone) if shipped else Path(weights)
     network, facts = load_backbone(path)
-    if not shipped and backbone not in ("robust_defreg", network.registered_name):
+    if backbone not in (None, network.registered_name):
         raise ConfigError(
             f"{path} holds weights of {network.registered_name}, not of {backbone}; leave out the "
             "backbone or name the right one."
@@ -99,8 +101,12 @@ def load_model(
         prior = prior or _beside(f"{backbone}.prior.safetensors")
         calibration = calibration or _beside(f"{backbone}.calibration.json")
     found = load_calibration(Path(calibration)) if calibration else None
-    if found and found.facts.get("model") != file_digest(path):
-        raise DataError(f"{calibration} was made for other weights than {path}; calibrate anew.")
+    for what, file in (("model", path), ("prior", prior)):
+        if found and found.facts.get(what) != (file_digest(Path(file)) if file else None):
+            raise DataError(
+                f"{calibration} was made with another {what} than {file or 'none'}; run "
+                f"`dine calibrate` for this {what}."
+            )
     return Model(
         network,
         path,
@@ -219,14 +225,15 @@ def register(
     frame = Frame.of(transformed(places, matrix))
     start = frame.normalise(transformed(places, matrix))
     order = convention_order(start, model.convention)
-    samples, places, start = samples[order], places[order], start[order]
+    places, start = places[order], start[order]
     goal = frame.normalise(seen)
     where = chosen_device(device)
     notes: list[str] = []
     if rounds < 0:
         raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
     if partial:
-        found, spread, supported = _from_part(model.backbone, start, goal, where, rounds)
+        found, supported = _from_part(start, goal, rounds)
+        spread = None
         if not supported.all():
             notes.append(
                 f"{100 * (~supported).mean():.0f} % of the source has no counterpart in the target "
@@ -288,11 +295,14 @@ def _result(
         return Surface(move(surface.vertices), surface.faces, name=surface.name)
 
     partial = settings["partial"]
+    calibration = model.calibration
+    if calibration and (partial or settings["rounds"] != calibration.facts.get("rounds")):
+        calibration = None
     moved = moved_surface(source)
     displacement = moved.vertices - source.vertices
     uncertainty = at_points = expected = None
-    if model.calibration is not None and spread is not None:
-        error = model.calibration.expected_error(spread)
+    if calibration is not None and spread is not None:
+        error = calibration.expected_error(spread)
         aligned = frame.normalise(transformed(source.vertices, matrix))
         uncertainty = carry(start, error[:, None], aligned)[:, 0] * frame.scale
         at_points = error * frame.scale
@@ -303,9 +313,10 @@ def _result(
         "reach": float(np.linalg.norm(found, axis=1).max()),
         "folding": folding(start, found),
     }
-    if model.prior is not None:
+    # Only the calibration knows in which order of points the prior was fitted.
+    if model.prior is not None and calibration is not None:
         values |= plausibility(model.prior, found) or {}
-    trust = assess(model.calibration, values, expected, notes=notes)
+    trust = assess(calibration, values, expected, notes=notes)
     dense_target = _dense(target)
     dense_source = _dense(source)
     report: dict[str, Any] = {
@@ -358,7 +369,7 @@ def _result(
         uncertainty,
         applied,
         places,
-        move(places) - places,
+        frame.restore(start + found) - places,
         at_points,
         supported,
         trust,
@@ -436,24 +447,19 @@ def _aligned(
     raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
 
 
-def _from_part(
-    backbone: Any, start: np.ndarray, goal: np.ndarray, device: torch.device, rounds: int
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Displacement, spread and support (N,) of source points whose target is a part of them.
+def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement (N, 3) and support (N,) of source points whose target is a part of them.
 
     The part is registered to the whole, in which each of its points has a counterpart; the inverse
-    is known where they end up and carried from there.
+    is known where they end up and carried from there. Networks mistake parts for wholes, so they
+    have no say.
 
     Raises:
         DataError: the part ends up beside the source.
     """
     frame = Frame.of(goal)
     part, whole = frame.normalise(goal), frame.normalise(start)
-    back = refine(
-        part, whole, np.zeros_like(part), np.full(len(part), 0.3), rounds=rounds, part=True
-    )
-    spread = None
-    back = back * frame.scale
+    back = refine(part, whole, None, None, rounds=rounds, part=True) * frame.scale
     places = goal + back
     reach = _RETURN * float(np.median(cKDTree(start).query(start, k=2)[0][:, 1]))
     supported = distances(start, places) < reach
@@ -462,10 +468,7 @@ def _from_part(
             "Hardly any part of the source is found in the target; check that both show the same "
             "object, or leave out `partial`."
         )
-    found = carry(places, -back, start)
-    if spread is not None:
-        spread = carry(places, spread[:, None] * frame.scale, start)[:, 0]
-    return found, spread, supported
+    return carry(places, -back, start), supported
 
 
 def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:

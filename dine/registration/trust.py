@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from dine.registration.calibration import Calibration
 
 _RARE = 99.0
@@ -62,7 +60,9 @@ def assess(
             "does not do."
         )
     if calibration is None:
-        reasons.append("There is no calibration for these weights, so nothing more can be said.")
+        reasons.append(
+            "There is no calibration for these weights and settings, so nothing more can be said."
+        )
     else:
         for name, value in values.items():
             if name not in calibration.reference:
@@ -72,7 +72,7 @@ def assess(
             if name in _UNLIKE and percentiles[name] >= _RARE and value > highest:
                 reasons.append(_UNLIKE[name].format(p=min(percentiles[name], 100)))
                 serious += name in _SERIOUS
-                # Twice what was ever seen is no matter of percentiles any more.
+                # Four times what was ever seen is no matter of percentiles any more.
                 serious += name in _SERIOUS and value > 4 * highest
     usual = max(calibration.reference["folding"]) if calibration else 0.0
     if serious >= 2 or folded > max(5 * _FOLDED, 2 * usual):
@@ -82,8 +82,3 @@ def assess(
     else:
         verdict = GOOD
     return Trust(verdict, tuple(reasons), percentiles, expected_error)
-
-
-def finite(value: float) -> float | None:
-    """For JSON, which has no NaN."""
-    return value if np.isfinite(value) else None
