@@ -18,6 +18,7 @@ include: "workflow/rules/evaluate.smk"
 include: "workflow/rules/report.smk"
 include: "workflow/rules/pretraining.smk"
 include: "workflow/rules/registration.smk"
+include: "workflow/rules/evidence.smk"
 
 
 rule all:

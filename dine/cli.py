@@ -44,6 +44,23 @@ class Settings(click.ParamType):
         return config.validate_section(self.model, values, "--settings")
 
 
+class Mapping(click.ParamType):
+    """Keys and values as JSON text."""
+
+    name = "JSON"
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, dict):
+            return value
+        try:
+            values = json.loads(value)
+        except ValueError as error:
+            raise ConfigError(f"--{param.name} is not JSON: {error}.") from None
+        if not isinstance(values, dict):
+            raise ConfigError(f"--{param.name}: expected keys and values, found {value}.")
+        return values
+
+
 def settings_option(model: type[config.Section]):
     return click.option(
         "--settings",
@@ -61,6 +78,13 @@ batch_option = click.option(
 )
 variants_option = click.option(
     "--variant", "variants", type=IN, multiple=True, help="Corrupted targets; repeatable."
+)
+levels_option = click.option(
+    "--at",
+    "levels",
+    type=float,
+    multiple=True,
+    help="Deformation level to draw for; repeatable. All of them by default.",
 )
 pairs_option = click.option("--pairs", type=IN, required=True, help="Pairs (HDF5).")
 targets_option = click.option(
@@ -226,47 +250,51 @@ def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
 @click.option("--raw", "raw_file", type=IN, required=True, help="raw.json of `dine raw`.")
 @settings_option(config.Pairs)
 @seed_option
+@click.option("--test-only", is_flag=True, help="All objects for testing, whatever the split.")
 @click.option("--out", type=OUT, required=True, help="Pairs to write (HDF5).")
-def pairs(raw_file: Path, settings: config.Pairs, seed: int, out: Path):
+def pairs(raw_file: Path, settings: config.Pairs, seed: int, test_only: bool, out: Path):
     """Turn raw meshes into index-consistent source/target pairs.
 
     Example: dine pairs --raw mine/raw.json --out pairs.h5
     """
     from dine.data.prepare import prepare_pairs
 
-    prepare_pairs(raw_file, settings, seed=seed, out=out)
+    prepare_pairs(raw_file, settings, seed=seed, out=out, test_only=test_only)
 
 
 @cli.command()
 @pairs_option
 @click.option("--condition", type=click.Choice(["noise", "outliers"]), required=True)
 @click.option("--level", type=float, required=True, help="Noise sigma, or outliers in percent.")
+@levels_option
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Variant to write (HDF5).")
-def corrupt(pairs: Path, condition: str, level: float, seed: int, out: Path):
+def corrupt(pairs: Path, condition: str, level: float, levels, seed: int, out: Path):
     """Draw corrupted targets for the test split.
 
     Example: dine corrupt --pairs pairs.h5 --condition noise --level 0.03 --out noise.h5
     """
-    from dine.data.pairs import make_variant, read_pairs, write_variant
+    from dine.data.pairs import at_levels, make_variant, read_pairs, write_variant
 
     test = read_pairs(pairs, split="test")
-    write_variant(out, make_variant(test, condition, level, seed), test.checksum)
+    variant = make_variant(at_levels(test, levels), condition, level, seed)
+    write_variant(out, variant, test.checksum)
 
 
 @cli.command()
 @click.option("--raw", "raw_file", type=IN, required=True, help="raw.json of `dine raw`.")
 @pairs_option
+@levels_option
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Targets to write (HDF5).")
-def resample(raw_file: Path, pairs: Path, seed: int, out: Path):
+def resample(raw_file: Path, pairs: Path, levels, seed: int, out: Path):
     """Draw the points of all targets anew, as two scans of one object never share points.
 
     Example: dine resample --raw mine/raw.json --pairs pairs.h5 --out resampled.h5
     """
     from dine.data.prepare import resample_targets
 
-    resample_targets(raw_file, pairs, seed=seed, out=out)
+    resample_targets(raw_file, pairs, seed=seed, out=out, levels=levels)
 
 
 @cli.command()
@@ -431,7 +459,7 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute
 @pairs_option
 @model_option
 @click.option("--variant", default=config.CONTROL, show_default=True, help="Prior's name.")
-@click.option("--prior", type=IN, help="Prior's file; none for the control.")
+@click.option("--prior", type=IN, help="Prior's file; by default none.")
 @click.option("--lambda", "weight", help="A number, or the file of `dine search-lambda`.")
 @settings_option(config.Stage2)
 @seed_option
@@ -440,6 +468,8 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute
 @click.option("--out", type=FOLDER, required=True, help="Run folder.")
 def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, out):
     """Refine a Stage-1 model with λ times a frozen prior; without a prior, the λ = 0 control.
+
+    A variant of another name without a prior differs from the control in `data_term`.
 
     Example: dine stage2 --pairs pairs.h5 --model model.safetensors --variant pca --prior
     pca.safetensors --lambda lambda.json --out runs/pca
@@ -501,15 +531,16 @@ def predict(model, pairs, variants, batch_size, compute, name, out):
 
 
 @cli.command()
-@click.option("--predictions", type=IN, required=True)
+@click.option("--predictions", type=IN, required=True, multiple=True, help="One for each method.")
 @pairs_option
 @variants_option
 @click.option("--dataset", required=True)
 @click.option("--backbone", required=True)
-@click.option("--method", required=True)
-@click.option("--point-errors", type=OUT, required=True, help="Per-point errors (HDF5).")
+@click.option("--method", "methods", required=True, multiple=True, help="Its name; repeatable.")
+@seed_option
+@click.option("--point-errors", type=OUT, help="Per-point errors to write as well (HDF5).")
 @click.option("--out", type=OUT, required=True, help="Metrics (CSV).")
-def evaluate(predictions, pairs, variants, dataset, backbone, method, point_errors, out):
+def evaluate(predictions, pairs, variants, dataset, backbone, methods, seed, point_errors, out):
     """Compute metrics from stored predictions.
 
     Example: dine evaluate --predictions predictions.h5 --pairs pairs.h5 --dataset mine
@@ -517,16 +548,87 @@ def evaluate(predictions, pairs, variants, dataset, backbone, method, point_erro
     """
     from dine.evaluation.metrics import evaluate as run
 
+    if len(set(methods)) != len(predictions):
+        raise ConfigError(
+            "Give one --method, each with a name of its own, for every --predictions."
+        )
     run(
-        predictions,
+        dict(zip(methods, predictions, strict=True)),
         pairs,
         list(variants),
         out,
         point_errors,
         dataset=dataset,
         backbone=backbone,
-        method=method,
+        seed=seed,
     )
+
+
+@cli.command("refine-predictions")
+@click.option("--predictions", type=IN, required=True, help="Of `dine predict`.")
+@pairs_option
+@variants_option
+@click.option("--settings", type=Settings(config.RefinedMethod), default='{"kind": "refined"}')
+@click.option("--prior", type=IN, help="Prior's file; by default none.")
+@name_option
+@click.option("--out", type=OUT, required=True, help="Predictions to write (HDF5).")
+def refine_predictions(predictions, pairs, variants, settings, prior, name, out):
+    """Refine a network's stored fields at test time, pair by pair.
+
+    Example: dine refine-predictions --predictions predictions.h5 --pairs pairs.h5 --out refined.h5
+    """
+    from dine.registration.predictions import refine_predictions as run
+
+    _start_torch()
+    run(
+        predictions,
+        pairs,
+        list(variants),
+        out,
+        settings=settings,
+        prior=prior,
+        name=name or "refine",
+    )
+
+
+@cli.command()
+@pairs_option
+@variants_option
+@click.option("--algorithm", required=True, help="unregistered, icp, cpd, bcpd, smooth, or a path.")
+@click.option("--arguments", type=Mapping(), default="{}", help="Of the algorithm, as JSON.")
+@name_option
+@click.option("--out", type=OUT, required=True, help="Predictions to write (HDF5).")
+def classical(pairs, variants, algorithm, arguments, name, out):
+    """Register the test split and its corrupted variants without a network.
+
+    Example: dine classical --pairs pairs.h5 --algorithm cpd --out cpd.h5
+    """
+    from dine.registration.predictions import classical_predictions as run
+
+    run(
+        pairs, list(variants), out, algorithm=algorithm, arguments=arguments, name=name or algorithm
+    )
+
+
+@cli.command()
+@click.option("--prior", type=IN, required=True, help="Of `dine fit-prior` (safetensors).")
+@click.option("--fields", type=IN, required=True, help="That it was fitted to (HDF5).")
+@pairs_option
+@click.option("--dataset", default="", help="For the result.")
+@click.option("--backbone", default="", help="For the result.")
+@name_option
+@seed_option
+@click.option("--out", type=OUT, required=True, help="Result (JSON); samples beside it (PNG).")
+def diagnose(prior, fields, pairs, dataset, backbone, name, seed, out):
+    """Measure a prior on the true displacements of validation pairs, and draw samples of it.
+
+    Example: dine diagnose --prior pca.safetensors --fields dvf.h5 --pairs pairs.h5 --out pca.json
+    """
+    from dine.reporting.priors import diagnose_prior
+
+    _start_torch()
+    facts = {"dataset": dataset, "backbone": backbone, "prior": name or prior.stem}
+    diagnose_prior(prior, fields, pairs, out, seed=seed, facts=facts)
 
 
 @cli.command()
@@ -571,6 +673,61 @@ def report(results, settings, out):
     from dine.reporting.build import build_report
 
     build_report(results, settings, out)
+
+
+def _json_or_file(context, parameter, value):
+    """JSON text, or a JSON or YAML file, with or without @ before its name."""
+    if value is None or not value.lstrip().startswith("{"):
+        return None if value is None else config.read_yaml(value.removeprefix("@"))
+    try:
+        return json.loads(value)
+    except ValueError as error:
+        raise ConfigError(f"{parameter.opts[0]} is neither JSON nor a file: {error}.") from None
+
+
+@cli.command()
+@click.argument("metrics", nargs=-1, required=True, type=IN)
+@click.option(
+    "--methods",
+    callback=_json_or_file,
+    default="{}",
+    show_default=False,
+    metavar="JSON|FILE",
+    help="Title, group and description of each method.",
+)
+@click.option("--reference", default=config.CONTROL, help="What methods are compared with.")
+@click.option("--search", "searches", type=IN, multiple=True, help="Of `search-lambda`.")
+@click.option("--diagnostics", type=IN, multiple=True, help="JSON of a prior; repeatable.")
+@click.option(
+    "--example",
+    "examples",
+    type=(str, IN, str),
+    multiple=True,
+    metavar="DATASET PNG TEXT",
+    help="A picture to show, and its caption; repeatable.",
+)
+@click.option(
+    "--settings", callback=_json_or_file, metavar="JSON|FILE", help="Configuration to show."
+)
+@click.option("--out", type=FOLDER, required=True, help="Folder for report, tables and figures.")
+def evidence(metrics, methods, reference, searches, diagnostics, examples, settings, out):
+    """Write the report on whether a prior helps: tests, tables, figures and findings.
+
+    Example: dine evidence a/metrics.csv b/metrics.csv --methods '{"pca": {"title": "PCA prior",
+    "group": "prior"}}' --search lambda.json --out evidence
+    """
+    from dine.reporting.evidence import Picture, build_evidence
+
+    build_evidence(
+        metrics,
+        out,
+        methods=methods,
+        reference=reference,
+        searches=searches,
+        diagnostics=diagnostics,
+        examples=[Picture(*example) for example in examples],
+        config=settings,
+    )
 
 
 # --- own scans ------------------------------------------------------------------------------------

@@ -150,6 +150,8 @@ class BackboneConfig(Section):
     """Keyword arguments of the class."""
     priors: list[str] = ["pca"]
     """Priors whose Stage 2 is trained with this backbone."""
+    start: str | None = None
+    """In place of `stage1.start`, for this backbone."""
 
 
 class PriorConfig(Section):
@@ -157,6 +159,9 @@ class PriorConfig(Section):
     """A built-in prior or an import path `package.module:Class`."""
     arguments: dict[str, Any] = {}
     """Keyword arguments of the class's `fit`."""
+    fields: Literal["predicted", "exact", "shuffled"] = "predicted"
+    """What it is fitted to: Stage-1 fields (the paper), the true displacements, or, as a prior that
+    must be wrong, Stage-1 fields with the points of each in an order of its own."""
 
 
 class PCAArguments(Section):
@@ -180,6 +185,47 @@ class FlowArguments(Section):
     batch_size: Count = 2048
     """Displacement vectors per step."""
     learning_rate: Positive = 1.0e-3
+
+
+class PCAResidualArguments(PCAArguments):
+    folds: Annotated[Count, Field(ge=2)] = 5
+    """Folds of the cross-validation that gives the residual's variance."""
+
+
+class GaussianProcessArguments(Section):
+    widths: list[Positive] = Field(default=[0.2, 0.4, 0.8, 1.6], min_length=1)
+    """Widths of the squared exponentials, in the normalised frame; their amplitudes are fitted."""
+    rank: Count = 128
+    """Rank of the covariance between the points of a source."""
+    points: Count = 256
+    """Points of each field that the fit looks at."""
+    sources: Count = 64
+    """Largest number of different sources that the fit looks at."""
+    least_noise: Positive = 1.0e-3
+    """Smallest standard deviation of what points do independently, in the normalised frame."""
+
+
+class SmoothnessArguments(Section):
+    neighbours: Count = 10
+    """Nearest neighbours of each source point that should move like it."""
+    anchor: Annotated[Positive, Field(lt=1)] = 0.01
+    """Share of the magnitude in the penalty, besides the roughness; makes the density proper."""
+
+
+class LatentFlowArguments(PCAResidualArguments):
+    transforms: Count = 4
+    """RealNVP coupling layers."""
+    hidden: Count = 64
+    """Width of the hidden layers of each coupling."""
+    steps: Count = 600
+    """Largest number of optimiser steps of the maximum-likelihood fit."""
+    patience: Count = 200
+    """Steps without a better held-out likelihood after which the fit stops."""
+    batch_size: Count = 64
+    """Fields per step."""
+    learning_rate: Positive = 3.0e-4
+    weight_decay: NonNegative = 0.1
+    """AdamW's decoupled weight decay."""
 
 
 class Training(Section):
@@ -218,19 +264,26 @@ class Stage2(Training):
     """Optimiser steps."""
 
 
-class LambdaSearch(Section):
+class LambdaChoice(Section):
+    """How values of λ are compared."""
+
+    candidates: list[Positive] = Field(default=[1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3], min_length=1)
+    """Values of λ to try; λ = 0 is always tried too, for comparison."""
+    criterion: Literal["cd", "mce"] = "cd"
+    """What the best λ has the lowest mean of: Chamfer distance, or mean correspondence error."""
+    steps: Count = 80
+    """Stage-2 steps per candidate."""
+    validation_pairs: Count = 24
+    """Validation pairs on which the candidates are compared."""
+
+
+class LambdaSearch(LambdaChoice):
     dataset: str = "synbench"
     """Dataset whose validation split decides."""
     backbone: str = "robust_defreg"
     """Backbone that decides."""
     priors: list[str] = Field(default=["pca"], min_length=1)
     """Priors with a λ of their own; the others use the first one's."""
-    candidates: list[Positive] = Field(default=[1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3], min_length=1)
-    """Values of λ to try; λ = 0 is always tried too, for comparison."""
-    steps: Count = 80
-    """Stage-2 steps per candidate."""
-    validation_pairs: Count = 24
-    """Validation pairs on which the candidates are compared."""
 
 
 class Evaluation(Section):
@@ -248,6 +301,88 @@ class Pretraining(Training):
     """Share of the steps whose source is cut down to a part, as scans often show one."""
     objects: Count = 240
     """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
+
+
+class Method(Section):
+    """A method of the evidence, besides Stage 1, the control and the priors of each backbone."""
+
+    title: str = ""
+    """In tables and figures; by default its name."""
+    group: Literal["none", "classical", "prior", "control", "data term", "test time"] = "prior"
+    """Where the report lists it."""
+    description: str = ""
+    """One sentence for the report."""
+    datasets: list[str] | None = None
+    """Datasets that it is evaluated on; by default all."""
+
+
+class ClassicalMethod(Method):
+    kind: Literal["classical"]
+    group: Literal["none", "classical"] = "classical"
+    algorithm: str
+    """`unregistered`, `icp`, `cpd`, `bcpd`, `smooth`, or an import path `package.module:Class`."""
+    arguments: dict[str, Any] = {}
+    """Keyword arguments of the class."""
+
+
+class NetworkMethod(Method):
+    backbones: list[str] | None = None
+    """Backbones that it is used with; by default all that are not the evidence's own."""
+    seeds: Count | None = None
+    """How many of the seeds, from the first on; by default all."""
+    prior: str | None = None
+    data_term: str = "chamfer"
+
+
+class Stage2Method(NetworkMethod):
+    kind: Literal["stage2"]
+    weight: Positive | None = None
+    """λ; by default the best of `evidence.choice` on validation pairs."""
+
+
+class RefinedMethod(NetworkMethod):
+    kind: Literal["refined"]
+    group: Literal["test time"] = "test time"
+    algorithm: Literal["closed_form", "gradient"] = "closed_form"
+    """Expectation–maximisation under a Gaussian prior, or descent on any data term and prior."""
+    of: str = STAGE1
+    """The trained network whose field is refined."""
+    weight: NonNegative = 0.0
+    """λ of `gradient`."""
+    arguments: dict[str, Any] = {}
+    """`rounds` of the closed form, `steps` and `learning_rate` of the gradient."""
+
+
+AnyMethod = Annotated[ClassicalMethod | Stage2Method | RefinedMethod, Field(discriminator="kind")]
+
+
+class EvidenceBackbone(BackboneConfig):
+    seeds: Count | None = None
+    """How many of the seeds, from the first on; by default all."""
+
+
+class Evidence(Section):
+    """`snakemake -j2 evidence`: does a prior help, which, and how sure are we?"""
+
+    seeds: list[Annotated[int, BeforeValidator(_no_bool), Field(ge=0, lt=2**31)]] = Field(
+        default=[0, 1, 2], min_length=1
+    )
+    """Seeds of initial weights and training order; the data stay the same."""
+    test_objects: Count = 12
+    """Further synthetic objects of each dataset to evaluate on; other data use the test split."""
+    at_levels: list[Positive] = [0.5]
+    """Deformation levels at which targets are corrupted or resampled."""
+    noise: list[Positive] = [0.03]
+    """Standard deviations of Gaussian noise, in the normalised frame."""
+    outliers: list[Positive] = [25.0]
+    """Outliers in percent of the points."""
+    resampled: bool = True
+    """Also register to targets whose points were drawn anew, as two scans share none."""
+    backbones: dict[str, EvidenceBackbone] = {}
+    """Backbones for the evidence alone, such as one that starts elsewhere."""
+    choice: LambdaChoice = LambdaChoice(criterion="mce")
+    """How each method's λ is chosen, on the dataset and backbone of `lambda_search`."""
+    methods: dict[str, AnyMethod] = {}
 
 
 class Compute(Section):
@@ -278,6 +413,7 @@ class Config(Compute):
     lambda_search: LambdaSearch = LambdaSearch()
     evaluation: Evaluation = Evaluation()
     pretraining: Pretraining = Pretraining()
+    evidence: Evidence = Evidence()
 
     @model_validator(mode="after")
     def _references(self):
@@ -301,6 +437,7 @@ class Config(Compute):
             self._known("priors", prior, "lambda_search.priors")
         for name, prior in self.priors.items():
             check_arguments(prior, f"priors.{name}.arguments")
+        self._check_evidence()
         for stage in ("stage1", "stage2"):
             batch_size = getattr(self, stage).batch_size
             check_shares(batch_size, self.processes, f"{stage}.batch_size")
@@ -314,9 +451,61 @@ class Config(Compute):
                 f"(there: {', '.join(known)})"
             )
 
+    def _check_evidence(self) -> None:
+        taken = {STAGE1, CONTROL, *self.priors_of_stage2}
+        for name in self.evidence.backbones:
+            if name in self.backbones or not _NAME.match(name):
+                raise ValueError(
+                    f"`evidence.backbones.{name}` must have a name of its own, of lower-case "
+                    "letters, digits and underscores"
+                )
+        for name, backbone in self.evidence.backbones.items():
+            for prior in backbone.priors:
+                self._known("priors", prior, f"evidence.backbones.{name}.priors")
+        for name, method in self.evidence.methods.items():
+            where = f"evidence.methods.{name}"
+            if name in taken or not _NAME.match(name):
+                raise ValueError(
+                    f"`{where}` must have a name of its own, of lower-case letters, digits and "
+                    f"underscores; taken are {', '.join(sorted(taken))}"
+                )
+            for dataset in method.datasets or ():
+                self._known("datasets", dataset, f"{where}.datasets")
+            if isinstance(method, ClassicalMethod):
+                continue
+            for backbone in method.backbones or ():
+                if backbone not in self.every_backbone:
+                    raise ValueError(
+                        f"`{where}.backbones` names {backbone!r}, which is neither under "
+                        "`backbones` nor under `evidence.backbones`"
+                    )
+            if method.prior is not None:
+                self._known("priors", method.prior, f"{where}.prior")
+            if isinstance(method, RefinedMethod):
+                trained = {STAGE1, CONTROL} | {
+                    other
+                    for other, found in self.evidence.methods.items()
+                    if isinstance(found, Stage2Method)
+                }
+                if method.of not in trained:
+                    raise ValueError(
+                        f"`{where}.of` is {method.of!r}; expected one of "
+                        f"{', '.join(sorted(trained))}"
+                    )
+
+    @property
+    def every_backbone(self) -> dict[str, BackboneConfig]:
+        """All backbones, those of the evidence last."""
+        return {**self.backbones, **self.evidence.backbones}
+
+    @property
+    def priors_of_stage2(self) -> list[str]:
+        """Priors whose Stage 2 has the λ of `lambda_search`."""
+        return list(dict.fromkeys(p for b in self.every_backbone.values() for p in b.priors))
+
     def methods(self, backbone: str) -> list[str]:
         """What is evaluated for a backbone: Stage 1, the control, then its priors."""
-        return [STAGE1, CONTROL, *self.backbones[backbone].priors]
+        return [STAGE1, CONTROL, *self.every_backbone[backbone].priors]
 
 
 def check_shares(batch_size: int, processes: int, where: str = "batch_size") -> None:
@@ -328,7 +517,14 @@ def check_shares(batch_size: int, processes: int, where: str = "batch_size") -> 
         )
 
 
-PRIOR_ARGUMENTS: dict[str, type[Section]] = {"pca": PCAArguments, "flow": FlowArguments}
+PRIOR_ARGUMENTS: dict[str, type[Section]] = {
+    "pca": PCAArguments,
+    "flow": FlowArguments,
+    "pca_residual": PCAResidualArguments,
+    "gaussian_process": GaussianProcessArguments,
+    "smoothness": SmoothnessArguments,
+    "latent_flow": LatentFlowArguments,
+}
 
 
 def check_arguments(prior: PriorConfig, where: str = "arguments") -> dict[str, Any]:
@@ -368,20 +564,25 @@ def explain(error: ValidationError, where: str = "") -> str:
 def validate(values: Any, where: str = "the configuration") -> Config:
     """Check a mapping and fill in defaults.
 
-    A dataset, backbone or prior that is null is left out: that is how a file laid over another one
-    takes entries away.
+    A dataset, backbone, prior or method that is null is left out: that is how a file laid over
+    another one takes entries away.
 
     Raises:
         ConfigError: every fault, with key, value and what was expected.
     """
     if isinstance(values, dict):
-        values = {
-            key: {name: entry for name, entry in section.items() if entry is not None}
-            if key in NAMED and isinstance(section, dict)
-            else section
-            for key, section in values.items()
-        }
+        values = {key: _without_null(key, section) for key, section in values.items()}
     return validate_section(Config, values, where)
+
+
+def _without_null(key: str, section: Any) -> Any:
+    if not isinstance(section, dict):
+        return section
+    if key == "evidence":
+        return {inner: _without_null(inner, entry) for inner, entry in section.items()}
+    if key in (*NAMED, "methods"):
+        return {name: entry for name, entry in section.items() if entry is not None}
+    return section
 
 
 def validate_section(model: type[Section], values: Any, where: str):

@@ -48,11 +48,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "evaluation": ("evaluation",),
     "reporting": ("reporting",),
     "calibration": (
+        "evaluation/quality.py",
         "registration/calibration.py",
-        "registration/quality.py",
         "registration/refine.py",
     ),
-    "registration": ("registration",),
+    "registration": ("registration", "evaluation/quality.py"),
 }
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from dine.config import STAGE1, Config
+from dine.config import STAGE1, ClassicalMethod, Config
 
 CLEAN = "deformation"
 
@@ -14,7 +15,8 @@ PAPER_TABLES = {("deformedtissue", False): 1, ("synbench", False): 2, ("deformed
 
 
 def condition_key(condition: str, corruption: float) -> str:
-    """Name of a condition in files: ``deformation``, ``noise_0.03``, ``outliers_25``."""
+    """Name of a condition in files: ``deformation``, ``noise_0.03``, ``outliers_25``,
+    ``resampled_1``."""
     return condition if condition == CLEAN else f"{condition}_{corruption:g}"
 
 
@@ -37,6 +39,9 @@ class Results:
     def prior(self, dataset: str, backbone: str, prior: str) -> Path:
         return self.root / dataset / backbone / "priors" / f"{prior}.safetensors"
 
+    def evidence(self, *parts: str) -> Path:
+        return self.root.joinpath("evidence", *parts)
+
     @property
     def search(self) -> Path:
         return self.root / "lambda" / "lambda.json"
@@ -58,9 +63,67 @@ def runs(config: Config) -> list[tuple[str, str, str]]:
     ]
 
 
+def replica(config: Config, backbone: str, seed: int) -> str:
+    """Folder of a backbone trained with some seed, below that of its dataset."""
+    return backbone if seed == config.seed else f"{backbone}/seed{seed}"
+
+
+def backbone_and_seed(config: Config, folder: str) -> tuple[str, int]:
+    """The inverse of :func:`replica`."""
+    backbone, _, seed = folder.partition("/seed")
+    return backbone, int(seed) if seed else config.seed
+
+
+NO_BACKBONE = "none"
+"""Backbone of methods without one, which are compared with those of every backbone."""
+
+
+class Cell(NamedTuple):
+    """One evaluation of the evidence; methods without a backbone have seed 0."""
+
+    dataset: str
+    backbone: str
+    seed: int
+    method: str
+
+
+def evidence_cells(config: Config) -> list[Cell]:
+    """Every evaluation of the evidence."""
+    evidence = config.evidence
+    cells = []
+    for dataset in config.datasets:
+        for name, method in evidence.methods.items():
+            if isinstance(method, ClassicalMethod) and dataset in (method.datasets or [dataset]):
+                cells.append(Cell(dataset, NO_BACKBONE, 0, name))
+        for backbone, settings in config.every_backbone.items():
+            for number, seed in enumerate(evidence.seeds[: getattr(settings, "seeds", None)]):
+                names = config.methods(backbone)
+                for name, method in evidence.methods.items():
+                    if isinstance(method, ClassicalMethod):
+                        continue
+                    fits = backbone in (method.backbones or config.backbones)
+                    fits &= dataset in (method.datasets or [dataset])
+                    if fits and number < (method.seeds or len(evidence.seeds)):
+                        names.append(name)
+                cells += [Cell(dataset, backbone, seed, name) for name in names]
+    return cells
+
+
+def evidence_conditions(config: Config) -> list[tuple[str, float]]:
+    """The corrupted conditions of the evidence, and that of targets with other points."""
+    evidence = config.evidence
+    found = [("noise", x) for x in evidence.noise] + [("outliers", x) for x in evidence.outliers]
+    return found + ([("resampled", 1.0)] if evidence.resampled else [])
+
+
+def evidence_names(config: Config, kind: type) -> list[str]:
+    """Names of the evidence's methods of one kind, such as ``Stage2Method``."""
+    return [name for name, method in config.evidence.methods.items() if isinstance(method, kind)]
+
+
 def pca_priors(config: Config, backbone: str) -> list[str]:
     """The PCA priors used with a backbone, whose spectrum and modes are drawn."""
-    return [p for p in config.backbones[backbone].priors if config.priors[p].kind == "pca"]
+    return [p for p in config.every_backbone[backbone].priors if config.priors[p].kind == "pca"]
 
 
 def figure_names(config: Config) -> list[str]:

@@ -22,7 +22,7 @@ from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.priors import load_prior
-from dine.training.objective import DATA_TERMS
+from dine.training.data_terms import DATA_TERMS
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples" / "extending"

@@ -12,7 +12,8 @@ from test_training import IDENTITY, SETTINGS, Exploding, toy_pairs
 from dine.errors import ConfigError, DineError
 from dine.models.backbones import Backbone, Registration
 from dine.training import loop, parallel
-from dine.training.objective import DATA_TERMS, Objective
+from dine.training.data_terms import DATA_TERMS
+from dine.training.objective import Objective
 from dine.training.state import Interrupted, one_writer
 
 ROUNDING = 1e-5

@@ -14,12 +14,12 @@ from dine.data.pairs import PAIR_DATASETS, PairSet, write_pairs
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
+from dine.evaluation.quality import fit, folding, landmark_errors
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
 from dine.priors.pca import PCAPrior
 from dine.registration.calibration import Calibration, load_calibration, plausibility
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
-from dine.registration.quality import fit, folding, landmark_errors
 from dine.registration.refine import covariance, refine
 from dine.registration.register import load_model
 from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess

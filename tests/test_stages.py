@@ -21,11 +21,11 @@ from dine.data.fields import read_fields
 from dine.data.obtain import obtain
 from dine.data.pairs import read_pairs, read_seen, read_variant, write_pairs
 from dine.errors import CheckpointError, ConfigError, DataError
-from dine.evaluation.metrics import chamfer
+from dine.evaluation.quality import chamfer
 from dine.files import read_json
 from dine.priors import load_prior
 from dine.training import stages
-from dine.training.objective import DATA_TERMS
+from dine.training.data_terms import DATA_TERMS
 
 STAGE1 = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
 STAGE2 = '{"steps": 2, "validate_every": 2, "validation_pairs": 1}'

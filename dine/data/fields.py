@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import h5py
 import numpy as np
 
 from dine.errors import DataError
+from dine.files import atomic_path
 
 FIELDS_FORMAT = "dine-fields"
 """Fields of one model on the training split, at the top level of the file."""
@@ -33,6 +35,21 @@ def opened(path: str | os.PathLike, expected: str) -> Iterator[h5py.File]:
         raise DataError(f"{path} is damaged ({error}); delete it and run again.") from error
 
 
+@dataclass(frozen=True)
+class TrainingFields:
+    """What priors are fitted to, (K, N, 3) float32 each, normalised frame.
+
+    Attributes:
+        displacement: predicted by a Stage-1 model.
+        source: the points that move.
+        true: their true displacements.
+    """
+
+    displacement: np.ndarray
+    source: np.ndarray
+    true: np.ndarray
+
+
 def put_fields(group: h5py.Group, pair: np.ndarray, displacement: np.ndarray) -> None:
     """Store (P, N, 3) fields in the normalised frame and the (P,) names of their pairs."""
     data = group.create_dataset(
@@ -52,11 +69,26 @@ def get_names(group: h5py.Group) -> np.ndarray:
     return group["pair"].asstr()[:].astype(str)
 
 
-def read_fields(path: str | os.PathLike) -> np.ndarray:
-    """The (K, N, 3) float32 training fields that a prior is fitted to.
+def write_training_fields(
+    path: str | os.PathLike, pair: np.ndarray, fields: TrainingFields, **facts: str
+) -> None:
+    """Write the fields of the training split atomically; ``pair`` (K,) names them."""
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(format=FIELDS_FORMAT, **facts)
+        put_fields(file, pair, fields.displacement)
+        for name, what in (("source", "source points"), ("true", "true displacements")):
+            values = getattr(fields, name)
+            data = file.create_dataset(
+                name, data=values, chunks=(1, *values.shape[1:]), fletcher32=True
+            )
+            data.attrs["description"] = f"(K, N, 3) {what}, normalised frame"
+
+
+def read_fields(path: str | os.PathLike) -> TrainingFields:
+    """The training fields that a prior is fitted to.
 
     Raises:
         DataError: missing, damaged, or another kind of file.
     """
     with opened(path, FIELDS_FORMAT) as file:
-        return file["displacement"][:]
+        return TrainingFields(*(file[name][:] for name in ("displacement", "source", "true")))

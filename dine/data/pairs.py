@@ -320,22 +320,51 @@ def read_variant(path: str | os.PathLike, pairs: PairSet) -> Variant:
         DataError: the file is missing, truncated, damaged or something else, was made from other
             pairs, or lacks some of them.
     """
+    some, variant = _read_common(path, pairs)
+    if len(some) < len(pairs):
+        known = set(some.name.tolist())
+        missing = [name for name in pairs.name.tolist() if name not in known]
+        raise _other_pairs(path, f"it lacks {len(missing)} of them, such as {missing[0]!r}")
+    return variant
+
+
+def read_variant_subset(path: str | os.PathLike, pairs: PairSet) -> tuple[PairSet, Variant]:
+    """The pairs that a variant has, in the order of ``pairs``, and its rows in the same order.
+
+    Raises:
+        DataError: the file is missing, truncated, damaged or something else, was made from other
+            pairs, or has none of these.
+    """
+    some, variant = _read_common(path, pairs)
+    if len(some) == 0:
+        raise _other_pairs(path, "it has none of them")
+    return some, variant
+
+
+def _read_common(path: str | os.PathLike, pairs: PairSet) -> tuple[PairSet, Variant]:
+    """The pairs that a variant made from them has, possibly none, and its rows of these."""
     with _opened(path, VARIANT_FORMAT, _VARIANT_DATASETS) as (file, attributes):
         columns = _read_columns(file, _VARIANT_DATASETS)
         _verify(columns, attributes)
         columns = _decoded(columns)
         condition, level = str(attributes["condition"]), float(attributes["level"])
         made_from = attributes["pairs"]
+    if made_from != pairs.checksum:
+        raise _other_pairs(path)
     position = {name: row for row, name in enumerate(columns["name"].tolist())}
-    missing = [name for name in pairs.name.tolist() if name not in position]
-    if made_from != pairs.checksum or missing:
-        lacking = f"it lacks {len(missing)} of them, such as {missing[0]!r}" if missing else ""
-        raise DataError(
-            f"{path} was made from other pairs than those given"
-            f"{f' ({lacking})' if lacking else ''}; delete it and run the same command again."
-        )
-    rows = [position[name] for name in pairs.name.tolist()]
-    return Variant(condition, level, **{name: values[rows] for name, values in columns.items()})
+    found = np.array([name in position for name in pairs.name.tolist()], dtype=bool)
+    some = pairs if found.all() else pairs.select(index=found)
+    rows = np.array([position[name] for name in some.name.tolist()], dtype=np.intp)
+    return some, Variant(
+        condition, level, **{name: values[rows] for name, values in columns.items()}
+    )
+
+
+def _other_pairs(path: str | os.PathLike, reason: str = "") -> DataError:
+    return DataError(
+        f"{path} was made from other pairs than those given{f' ({reason})' if reason else ''}; "
+        "delete it and run the same command again."
+    )
 
 
 def read_seen(
@@ -372,6 +401,22 @@ def _rows_of(parts: np.ndarray, split: str) -> np.ndarray:
     if split not in SPLITS:
         raise ConfigError(f"Unknown split {split!r}; expected one of {', '.join(SPLITS)}.")
     return np.flatnonzero(parts == split)
+
+
+def at_levels(pairs: PairSet, levels: Sequence[float]) -> PairSet:
+    """The pairs of some deformation levels; all of them where none is given.
+
+    Raises:
+        DataError: there are no such pairs.
+    """
+    if not levels:
+        return pairs
+    rows = np.isclose(pairs.level[:, None], np.asarray(levels)[None]).any(axis=1)
+    if not rows.any():
+        found = ", ".join(f"{level:g}" for level in np.unique(pairs.level))
+        asked = ", ".join(f"{level:g}" for level in levels)
+        raise DataError(f"There are no pairs of the levels {asked}; there are {found}.")
+    return pairs.select(index=rows)
 
 
 def keyed_rng(*key: Any) -> np.random.Generator:

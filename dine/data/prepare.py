@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from dine.data.pairs import (
     SPLITS,
     PairSet,
     Variant,
+    at_levels,
     keyed_rng,
     read_pairs,
     write_pairs,
@@ -40,20 +41,27 @@ from dine.progress import Progress
 _log = logging.getLogger(__name__)
 
 
-def prepare_pairs(raw: Path, settings: Pairs, *, seed: int, out: Path) -> None:
+def prepare_pairs(
+    raw: Path, settings: Pairs, *, seed: int, out: Path, test_only: bool = False
+) -> None:
     """Make all pairs of a dataset and write them; broken pairs are reported and left out.
+
+    With ``test_only`` all objects are for testing, whatever the settings' split.
 
     Raises:
         DataError: no usable pair, or too few base objects to split.
     """
     inventory, origin = obtained(raw)
     count = sum(files.condition == "deformation" for files in inventory.pairs)
+    split = settings.split.model_dump()
+    if test_only:
+        split = dict.fromkeys(split, 0.0) | {"test": 1.0}
     with Progress("pairs", count, unit="pair") as bar:
         pairs, _ = make_pairs(
             inventory,
             points=settings.points,
             convention=settings.convention,
-            split=settings.split.model_dump(),
+            split=split,
             seed=seed,
             origin=origin,
             progress=lambda done, total: bar.update(),
@@ -61,17 +69,22 @@ def prepare_pairs(raw: Path, settings: Pairs, *, seed: int, out: Path) -> None:
     write_pairs(out, pairs)
 
 
-def resample_targets(raw: Path, pairs_path: Path, *, seed: int, out: Path) -> None:
+def resample_targets(
+    raw: Path, pairs_path: Path, *, seed: int, out: Path, levels: Sequence[float] = ()
+) -> None:
     """Write targets whose points were drawn anew: same surfaces, no point-to-point counterpart.
 
     Two scans of one object never share points. The result is a variant of condition
-    ``resampled`` (level 1) of all pairs in the file; draws are keyed by seed and object.
+    ``resampled`` (level 1) of all pairs in the file, or of those of some deformation levels; draws
+    are keyed by seed and object.
 
     Raises:
         DataError: the pairs were not made from these raw files.
     """
     inventory, _ = obtained(raw)
     pairs = read_pairs(pairs_path)
+    checksum = pairs.checksum
+    pairs = at_levels(pairs, levels)
     files = {_pair_name(pair): pair for pair in inventory.pairs if pair.condition == "deformation"}
     missing = [name for name in pairs.name.tolist() if name not in files]
     if missing:
@@ -87,7 +100,7 @@ def resample_targets(raw: Path, pairs_path: Path, *, seed: int, out: Path) -> No
             targets[row] = (drawn - pairs.center[row]) / pairs.scale[row]
             bar.update()
     inlier = np.ones(targets.shape[:2], bool)
-    write_variant(out, Variant(RESAMPLED, 1.0, targets, inlier, pairs.name), pairs.checksum)
+    write_variant(out, Variant(RESAMPLED, 1.0, targets, inlier, pairs.name), checksum)
 
 
 def measure_agreement(path: Path, *, seed: int) -> dict[str, object]:

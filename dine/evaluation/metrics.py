@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
@@ -10,107 +12,197 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from dine.data.fields import put_names
-from dine.data.pairs import PairSet, read_pairs, read_variant
-from dine.errors import DataError
+from dine.data.pairs import PairSet, read_pairs, read_variant_subset
+from dine.errors import ConfigError, DataError
 from dine.evaluation.predictions import read_predictions
+from dine.evaluation.quality import (
+    agreement,
+    chamfer,
+    correspondence,
+    distances,
+    folding,
+    neighbourhoods,
+    roughness,
+)
 from dine.files import atomic_path
 from dine.results import CLEAN, condition_key
 
 POINT_ERRORS_FORMAT = "dine-point-errors"
 
 
-def nearest_squared(a: np.ndarray, b: np.ndarray, tree: cKDTree | None = None) -> np.ndarray:
-    """Squared distance of each of (N, 3) points to the nearest of (M, 3), float64 (N,)."""
-    distance, _ = (tree or cKDTree(b)).query(a)
-    return distance**2
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What all predictions of a pair are measured with, float64, normalised frame."""
 
+    source: np.ndarray
+    target: np.ndarray
+    target_tree: cKDTree
+    neighbours: np.ndarray
+    unregistered: float
+    roughness: float
 
-def chamfer(a: np.ndarray, b: np.ndarray) -> float:
-    """Symmetric squared Chamfer distance of two clouds, as the paper's L_CD."""
-    return float(nearest_squared(a, b).mean() + nearest_squared(b, a).mean())
+    @classmethod
+    def of(cls, pairs: PairSet, index: int) -> _Known:
+        source, target = (x[index].astype(np.float64) for x in (pairs.source, pairs.target))
+        neighbours = neighbourhoods(source)
+        return cls(
+            source,
+            target,
+            cKDTree(target),
+            neighbours,
+            chamfer(source, target),
+            roughness(source, target - source, neighbours),
+        )
 
 
 def evaluate(
-    predictions: Path,
+    predictions: Mapping[str, Path],
     pairs_path: Path,
     variants: list[Path],
     out: Path,
-    point_errors: Path,
+    point_errors: Path | None,
     *,
     dataset: str,
     backbone: str,
-    method: str,
+    seed: int = 0,
 ) -> None:
-    """Write one row per test pair and condition, and the per-point errors for the histogram.
+    """Write one row per method, predicted test pair and condition, and the per-point errors.
 
-    Columns of ``out`` (CSV), all in the normalised frame: ``cd`` symmetric squared Chamfer distance
-    to the clean target, ``cd_observed`` the same to the target that the model saw,
-    ``cd_unregistered`` of the source as it is to the clean target, ``mce`` mean distance (not
-    squared) between a moved source point and its true position.
+    ``out`` (CSV) has the columns that docs/metrics.md defines. Distances are to the clean target in
+    the normalised frame and not squared, but for ``cd``, ``cd_observed`` (to the target that the
+    model saw) and ``cd_unregistered`` (of the source as it is), which are symmetric squared Chamfer
+    distances, and for ``mce_original``, which is in the units of the files. ``seconds`` is empty
+    where the predictions do not say it. Predictions and variants may be of some of the test pairs.
     ``point_errors`` (HDF5) has, per condition, ``pair`` and ``squared_distance`` (P, N).
+
+    Args:
+        predictions: of one or more methods, by their names.
+        pairs_path: the pairs they were made of.
+        variants: the corrupted targets they were made with.
+        out: one row per pair and condition.
+        point_errors: squared distances of the moved points to the clean target, of a single
+            method; None for no file.
+        dataset: written into every row, as are ``backbone`` and ``seed``.
+        backbone: ``none`` for methods without one.
+        seed: of the training, where there was one.
+
+    Raises:
+        DataError: a file is missing, damaged or made from other pairs, or lacks what the
+            predictions name.
+        ConfigError: per-point errors of several methods.
     """
+    if point_errors is not None and len(predictions) > 1:
+        raise ConfigError("Per-point errors are written for one method at a time.")
     pairs = read_pairs(pairs_path, split="test")
     position = {name: i for i, name in enumerate(pairs.name)}
     observed = {}
-    for path in variants:
-        variant = read_variant(path, pairs)
-        observed[condition_key(variant.condition, variant.level)] = variant.target
+    for variant_path in variants:
+        some, variant = read_variant_subset(variant_path, pairs)
+        observed[condition_key(variant.condition, variant.level)] = dict(
+            zip(some.name.tolist(), variant.target, strict=True)
+        )
     origin = str(pairs.attributes.get("origin", "unknown"))
-    unregistered = [chamfer(pairs.source[i], pairs.target[i]) for i in range(len(pairs))]
+    known: dict[int, _Known] = {}
     rows = []
     errors: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    for prediction in read_predictions(predictions):
+    found = [(m, path, p) for m, path in predictions.items() for p in read_predictions(path)]
+    for method, path, prediction in found:
         key = condition_key(prediction.condition, prediction.corruption)
-        if prediction.condition != CLEAN and key not in observed:
+        names = prediction.pair.tolist()
+        _require(names, position, path, pairs_path)
+        targets = None
+        if prediction.condition != CLEAN:
+            if key not in observed:
+                raise DataError(f"{path} has the condition {key}, but no variant file was given.")
+            targets = observed[key]
+            _require(names, targets, path, f"the variant file of {key}")
+        if prediction.displacement.shape[1:] != pairs.source.shape[1:]:
             raise DataError(
-                f"{predictions} has the condition {key}, but no variant file was given."
+                f"{path} has fields of {prediction.displacement.shape[1]} points, but "
+                f"{pairs_path} has {pairs.source.shape[1]}."
             )
         per_point = np.empty(prediction.displacement.shape[:2], np.float32)
-        for row, name in enumerate(prediction.pair):
-            if name not in position:
-                raise DataError(f"{predictions} names the pair {name!r}, unknown to {pairs_path}.")
+        for row, name in enumerate(names):
             index = position[name]
-            moved = pairs.source[index].astype(np.float64) + prediction.displacement[row]
-            target = pairs.target[index].astype(np.float64)
-            per_point[row] = nearest_squared(moved, target)
-            cd = float(
-                nearest_squared(moved, target).mean() + nearest_squared(target, moved).mean()
+            if index not in known:
+                known[index] = _Known.of(pairs, index)
+            values, distance = _measure(
+                known[index],
+                prediction.displacement[row],
+                None if targets is None else targets[name].astype(np.float64),
             )
-            seen = cd if key == CLEAN else chamfer(moved, observed[key][index].astype(np.float64))
+            per_point[row] = distance**2
             rows.append(
                 {
-                    **_identity(pairs, index, dataset, backbone, method, origin),
+                    "dataset": dataset,
+                    "backbone": backbone,
+                    "method": method,
+                    "seed": seed,
+                    "origin": origin,
+                    "pair": name,
+                    "object": pairs.object[index],
+                    "level": float(pairs.level[index]),
                     "condition": prediction.condition,
                     "corruption": prediction.corruption,
-                    "cd": cd,
-                    "cd_observed": seen,
-                    "cd_unregistered": unregistered[index],
-                    "mce": float(np.linalg.norm(moved - target, axis=1).mean()),
+                    **values,
+                    "mce_original": values["mce"] * float(pairs.scale[index]),
+                    "seconds": np.nan if prediction.seconds is None else prediction.seconds[row],
                 }
             )
         errors[key] = (prediction.pair, per_point)
-    with atomic_path(point_errors) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["format"] = POINT_ERRORS_FORMAT
-        for key, (names, values) in errors.items():
-            group = file.create_group(key)
-            put_names(group, names)
-            data = group.create_dataset("squared_distance", data=values, fletcher32=True)
-            data.attrs["description"] = (
-                "(P, N) squared distance of each moved source point to the clean target"
-            )
+    if point_errors is not None:
+        _write_point_errors(point_errors, errors)
     with atomic_path(out) as temporary:
         pd.DataFrame(rows).to_csv(temporary, index=False, float_format="%.9g")
 
 
-def _identity(
-    pairs: PairSet, index: int, dataset: str, backbone: str, method: str, origin: str
-) -> dict[str, object]:
-    return {
-        "dataset": dataset,
-        "backbone": backbone,
-        "method": method,
-        "origin": origin,
-        "pair": pairs.name[index],
-        "object": pairs.object[index],
-        "level": float(pairs.level[index]),
+def _write_point_errors(path: Path, errors: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["format"] = POINT_ERRORS_FORMAT
+        for key, (pair, values) in errors.items():
+            group = file.create_group(key)
+            put_names(group, pair)
+            data = group.create_dataset("squared_distance", data=values, fletcher32=True)
+            data.attrs["description"] = (
+                "(P, N) squared distance of each moved source point to the clean target"
+            )
+
+
+def _require(
+    names: list[str], known: Collection[str], predictions: Path, where: Path | str
+) -> None:
+    missing = [name for name in names if name not in known]
+    if missing:
+        raise DataError(f"{predictions} names the pair {missing[0]!r}, unknown to {where}.")
+
+
+def _measure(
+    known: _Known, displacement: np.ndarray, seen: np.ndarray | None
+) -> tuple[dict[str, float], np.ndarray]:
+    """All measures of a field (N, 3) and the distances (N,) of its points to the clean target.
+
+    ``seen`` (M, 3) is the target that the model saw, None for the clean one.
+    """
+    moved = known.source + displacement
+    moved_tree = cKDTree(moved)
+    distance = distances(moved, known.target_tree)
+    clean = agreement(distance, distances(known.target, moved_tree))
+    errors = correspondence(moved, known.target)
+    cd_observed = clean["chamfer"]
+    if seen is not None:
+        cd_observed = agreement(distances(moved, seen), distances(seen, moved_tree))["chamfer"]
+    field = displacement.astype(np.float64)
+    values = {
+        "cd": clean["chamfer"],
+        "cd_observed": cd_observed,
+        "cd_unregistered": known.unregistered,
+        "mce": errors.pop("mce"),
+        "cd_unsquared": clean["chamfer_unsquared"],
+        "hd95": clean["hd95"],
+        "hausdorff": clean["hausdorff"],
+        **errors,
+        "folding": folding(known.source, field, known.neighbours),
+        "roughness": roughness(known.source, field, known.neighbours),
+        "roughness_true": known.roughness,
     }
+    return values, distance

@@ -5,29 +5,57 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
 import numpy as np
 
-from dine.data.fields import get_names, opened
+from dine.data.fields import get_names, opened, put_fields
 from dine.results import CLEAN
 
 FORMAT = "dine-predictions"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prediction:
-    """One condition's fields.
+    """One condition's fields, of all test pairs or of some.
 
     Attributes:
-        condition: ``deformation``, ``noise`` or ``outliers``.
-        corruption: noise standard deviation or percentage of outliers; 0 where clean.
+        condition: ``deformation``, ``noise``, ``outliers`` or ``resampled``.
+        corruption: noise standard deviation or percentage of outliers, 1 where resampled, 0 where
+            clean.
         pair: (P,) pair names.
         displacement: (P, N, 3) float32, normalised frame.
+        spread: (P, N) float32 standard deviation of the marginals of belief propagation, normalised
+            frame; None from methods without marginals.
+        seconds: (P,) float64 wall time of each pair; None where it was not measured.
     """
 
     condition: str
     corruption: float
     pair: np.ndarray
     displacement: np.ndarray
+    spread: np.ndarray | None = None
+    seconds: np.ndarray | None = None
+
+
+def put_prediction(group: h5py.Group, prediction: Prediction) -> None:
+    """Write one condition into its group of a predictions file."""
+    group.attrs.update(condition=prediction.condition, corruption=prediction.corruption)
+    put_fields(group, prediction.pair, prediction.displacement)
+    if prediction.spread is not None:
+        data = group.create_dataset(
+            "spread",
+            data=np.asarray(prediction.spread, np.float32),
+            chunks=(1, prediction.spread.shape[1]),
+            fletcher32=True,
+        )
+        data.attrs["description"] = (
+            "(P, N) standard deviation of each source point's marginal, normalised frame"
+        )
+    if prediction.seconds is not None:
+        data = group.create_dataset(
+            "seconds", data=np.asarray(prediction.seconds, np.float64), fletcher32=True
+        )
+        data.attrs["description"] = "(P,) wall time of each pair in seconds"
 
 
 def read_predictions(path: Path) -> list[Prediction]:
@@ -43,6 +71,7 @@ def read_predictions(path: Path) -> list[Prediction]:
                 float(group.attrs["corruption"]),
                 get_names(group),
                 group["displacement"][:],
+                *(group[name][:] if name in group else None for name in ("spread", "seconds")),
             )
             for group in file.values()
         ]

@@ -9,7 +9,13 @@ from torch import Tensor, nn
 
 from dine.data.batch import Batch
 from dine.errors import ConfigError
-from dine.models.belief_propagation import Candidates, propagate, read_out, select_candidates
+from dine.models.belief_propagation import (
+    Candidates,
+    marginal_variance,
+    propagate,
+    read_out,
+    select_candidates,
+)
 from dine.models.features import FeatureNetwork
 from dine.registry import Registry
 
@@ -49,6 +55,18 @@ class Backbone(nn.Module):
 
     def forward(self, batch: Batch) -> Registration:
         raise NotImplementedError
+
+
+def marginal_deviation(backbone: Backbone, found: Registration) -> Tensor | None:
+    """Standard deviation (B, N) of each point's marginal, in the units of the displacement.
+
+    None where the backbone has no marginals.
+    """
+    if found.belief is None or found.candidates is None:
+        return None
+    temperature = backbone.arguments.get("temperature", 50.0)
+    variance = marginal_variance(found.candidates, found.belief, found.displacement, temperature)
+    return variance.clamp_min(0).sqrt()
 
 
 class BeliefPropagationBackbone(Backbone):

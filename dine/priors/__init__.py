@@ -1,7 +1,26 @@
-"""Deformation priors, by name: ``pca`` (full field) and ``flow`` (single vectors)."""
+"""Deformation priors, by name.
+
+Full field: ``pca`` (the paper's), ``pca_residual`` (what leaves the span costs, too) and
+``latent_flow`` (a flow in place of the Gaussian). Full field given its source:
+``gaussian_process`` and ``smoothness``. Single vectors: ``flow``.
+"""
 
 from dine.priors.base import PRIORS, Prior, load_prior
 from dine.priors.flow import FlowPrior
+from dine.priors.gaussian_process import GaussianProcessPrior
+from dine.priors.latent_flow import LatentFlowPrior
 from dine.priors.pca import PCAPrior
+from dine.priors.pca_residual import PCAResidualPrior
+from dine.priors.smoothness import SmoothnessPrior
 
-__all__ = ["PRIORS", "FlowPrior", "PCAPrior", "Prior", "load_prior"]
+__all__ = [
+    "PRIORS",
+    "FlowPrior",
+    "GaussianProcessPrior",
+    "LatentFlowPrior",
+    "PCAPrior",
+    "PCAResidualPrior",
+    "Prior",
+    "SmoothnessPrior",
+    "load_prior",
+]

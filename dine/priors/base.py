@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dine.errors import DataError
+from dine.errors import ConfigError, DataError
 from dine.models.checkpoint import load_state, load_tensors, save_tensors
+from dine.priors.gaussian import LinearGaussian
 from dine.registry import Registry
 
 PRIORS: Registry[Prior] = Registry("prior")
@@ -25,12 +26,16 @@ class Prior(nn.Module):
     :meth:`penalty`, :meth:`log_prob` and :meth:`sample`. Its buffers and parameters are what is
     saved.
 
+    Some priors are conditioned on the source, p(D | X). They set ``conditional`` and raise a
+    ``ConfigError`` where the source is left out; the others ignore it.
+
     Attributes:
         shape: constructor arguments, stored beside the tensors.
         notes: facts about the fit that a reader should see, such as a reduced rank.
     """
 
     registered_name: str
+    conditional: bool = False
 
     def __init__(self, **shape: Any):
         super().__init__()
@@ -38,24 +43,50 @@ class Prior(nn.Module):
         self.notes: dict[str, Any] = {}
 
     @classmethod
-    def fit(cls, fields: np.ndarray, *, seed: int = 0, **arguments: Any) -> Self:
-        """Estimate the prior from (K, N, 3) displacement fields."""
+    def fit(
+        cls,
+        fields: np.ndarray,
+        *,
+        seed: int = 0,
+        source: np.ndarray | None = None,
+        **arguments: Any,
+    ) -> Self:
+        """Estimate the prior from (K, N, 3) displacement fields of (K, N, 3) sources."""
         raise NotImplementedError
 
-    def penalty(self, displacement: Tensor, mask: Tensor | None = None) -> Tensor:
+    def penalty(
+        self, displacement: Tensor, mask: Tensor | None = None, source: Tensor | None = None
+    ) -> Tensor:
         """The differentiable term that Stage 2 adds, (B, N, 3) to (B,).
 
-        −log p up to the constants that the paper drops; ``mask`` is True at valid points.
+        −log p up to the constants that the paper drops; ``mask`` is True at valid points,
+        ``source`` (B, N, 3) the points that move.
         """
         raise NotImplementedError
 
-    def log_prob(self, displacement: Tensor) -> Tensor:
+    def log_prob(self, displacement: Tensor, source: Tensor | None = None) -> Tensor:
         """Log density of the modelled quantity, (B, N, 3) to (B,), constants included."""
         raise NotImplementedError
 
-    def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
-        """Fields drawn from the prior, (count, N, 3)."""
+    def sample(
+        self,
+        count: int,
+        generator: torch.Generator | None = None,
+        source: Tensor | None = None,
+    ) -> Tensor:
+        """Fields drawn from the prior, (count, N, 3); ``source`` (N, 3) is the one that moves."""
         raise NotImplementedError
+
+    def gaussian(self, source: np.ndarray) -> LinearGaussian:
+        """This prior as a linear Gaussian model of the fields of one source (N, 3).
+
+        Raises:
+            ConfigError: this prior is no Gaussian.
+        """
+        raise ConfigError(
+            f"The prior {self.registered_name!r} is not Gaussian, so the most probable field has "
+            "no closed form; choose a Gaussian prior, or refine by gradient."
+        )
 
     def freeze(self) -> Self:
         """Fix all tensors; gradients still reach the displacement."""

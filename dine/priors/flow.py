@@ -35,13 +35,14 @@ class FlowPrior(Prior):
         fields: np.ndarray,
         *,
         seed: int = 0,
+        source: np.ndarray | None = None,
         transforms: int = 6,
         hidden: int = 256,
         steps: int = 600,
         batch_size: int = 2048,
         learning_rate: float = 1e-3,
     ) -> Self:
-        """Maximum likelihood on the pooled vectors of (K, N, 3) fields.
+        """Maximum likelihood on the pooled vectors of (K, N, 3) fields, whatever their sources.
 
         A tenth of the fields is held out; ``notes`` keeps both negative log-likelihoods.
 
@@ -83,17 +84,24 @@ class FlowPrior(Prior):
         standard = (vectors - self.mean) / self.scale
         return self.flow().log_prob(standard) - self.scale.log().sum()
 
-    def penalty(self, displacement: Tensor, mask: Tensor | None = None) -> Tensor:
+    def penalty(
+        self, displacement: Tensor, mask: Tensor | None = None, source: Tensor | None = None
+    ) -> Tensor:
         values = -self._log_density(displacement)
         if mask is None:
             return values.mean(1)
         return values.masked_fill(~mask, 0).sum(1) / mask.sum(1)
 
-    def log_prob(self, displacement: Tensor) -> Tensor:
+    def log_prob(self, displacement: Tensor, source: Tensor | None = None) -> Tensor:
         """Mean log density of the field's vectors."""
         return -self.penalty(displacement)
 
-    def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self,
+        count: int,
+        generator: torch.Generator | None = None,
+        source: Tensor | None = None,
+    ) -> Tensor:
         points = self.shape["points"]
         base = torch.randn(count, points, 3, generator=generator, dtype=self.mean.dtype)
         with torch.no_grad():

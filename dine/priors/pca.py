@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dine.errors import DataError
 from dine.priors.base import PRIORS, Prior, check_fields
+from dine.priors.gaussian import LinearGaussian
 
 log = logging.getLogger(__name__)
 
@@ -41,12 +42,13 @@ class PCAPrior(Prior):
         fields: np.ndarray,
         *,
         seed: int = 0,
+        source: np.ndarray | None = None,
         components: int = 64,
         shrinkage: float = 0.05,
         epsilon_std: float = 1e-6,
         epsilon_covariance: float = 1e-3,
     ) -> Self:
-        """Fit to (K, N, 3) fields.
+        """Fit to (K, N, 3) fields; nothing depends on ``seed`` and ``source``.
 
         K fields span at most K − 1 directions about their mean, so fewer components are kept when
         K is small; ``notes["components_requested"]`` then tells what was asked for.
@@ -54,6 +56,20 @@ class PCAPrior(Prior):
         Raises:
             DataError: fewer than two fields, a bad shape, or fields that are all equal.
         """
+        span = (components, shrinkage, epsilon_std, epsilon_covariance)
+        return cls._of_span(fields, *span).freeze()
+
+    @classmethod
+    def _of_span(
+        cls,
+        fields: np.ndarray,
+        components: int,
+        shrinkage: float,
+        epsilon_std: float,
+        epsilon_covariance: float,
+        **shape: Any,
+    ) -> Self:
+        """The prior with span and latent covariance of the fields; ``shape`` goes to the class."""
         # Only fitting needs scikit-learn, which takes a while to import.
         from sklearn.covariance import empirical_covariance, shrunk_covariance
         from sklearn.decomposition import PCA
@@ -72,7 +88,7 @@ class PCAPrior(Prior):
         covariance = shrunk_covariance(empirical_covariance(latent), shrinkage)
         covariance += epsilon_covariance * np.eye(kept)
 
-        prior = cls(points=fields.shape[1], components=kept)
+        prior = cls(points=fields.shape[1], components=kept, **shape)
         for name, value in (
             ("mean", mean),
             ("scale", scale),
@@ -93,33 +109,68 @@ class PCAPrior(Prior):
                 kept,
                 components,
             )
-        return prior.freeze()
+        return prior
 
-    def latent(self, displacement: Tensor) -> Tensor:
-        """Latent coordinates z, (B, N, 3) to (B, n_c)."""
+    def normalised(self, displacement: Tensor) -> Tensor:
+        """Standardised coordinates (D − μ)/(σ + ε_σ), (B, N, 3) to (B, 3N)."""
         if displacement.shape[1:] != (self.shape["points"], 3):
             raise DataError(
                 f"The PCA prior was fitted to fields of {self.shape['points']} points; found a "
                 f"field of shape {tuple(displacement.shape[1:])}."
             )
-        return ((displacement.flatten(1) - self.mean) / self.scale) @ self.basis.T
+        return (displacement.flatten(1) - self.mean) / self.scale
 
-    def penalty(self, displacement: Tensor, mask: Tensor | None = None) -> Tensor:
+    def latent(self, displacement: Tensor) -> Tensor:
+        """Latent coordinates z, (B, N, 3) to (B, n_c)."""
+        return self.normalised(displacement) @ self.basis.T
+
+    def whitened(self, latent: Tensor) -> Tensor:
+        """L⁻¹z with the Cholesky factor of Σ_reg = LLᵀ, (B, n_c) to (B, n_c)."""
+        factor = torch.linalg.cholesky(self.covariance)
+        return torch.linalg.solve_triangular(factor, latent.T, upper=False).T
+
+    def mahalanobis(self, displacement: Tensor) -> Tensor:
+        """zᵀ Σ_reg⁻¹ z = ‖L⁻¹z‖², (B, N, 3) to (B,); n_c on average over the fields of the fit."""
+        return self.whitened(self.latent(displacement)).T.square().sum(0)
+
+    def residual(self, displacement: Tensor) -> Tensor:
+        """‖D̃ − Vz‖² outside the span, in standardised coordinates, (B, N, 3) to (B,)."""
+        normalised = self.normalised(displacement)
+        return (normalised - normalised @ self.basis.T @ self.basis).square().sum(1)
+
+    def projected(self, displacement: Tensor) -> Tensor:
+        """The closest field of the span in standardised coordinates, (B, N, 3) to (B, N, 3)."""
+        latent = self.latent(displacement)
+        return (self.mean + self.scale * (latent @ self.basis)).view_as(displacement)
+
+    def check_complete(self, mask: Tensor | None) -> None:
+        """Refuse fields of which ``mask`` (B, N) leaves points out.
+
+        Raises:
+            DataError: it does.
+        """
         if mask is not None and not mask.all():
             raise DataError("The PCA prior needs complete fields; it cannot skip points.")
-        # Cholesky of Σ_reg = LLᵀ: zᵀ Σ_reg⁻¹ z = ‖L⁻¹z‖².
-        factor = torch.linalg.cholesky(self.covariance)
-        whitened = torch.linalg.solve_triangular(factor, self.latent(displacement).T, upper=False)
-        return whitened.square().sum(0)
 
-    def log_prob(self, displacement: Tensor) -> Tensor:
+    def penalty(
+        self, displacement: Tensor, mask: Tensor | None = None, source: Tensor | None = None
+    ) -> Tensor:
+        self.check_complete(mask)
+        return self.mahalanobis(displacement)
+
+    def log_prob(self, displacement: Tensor, source: Tensor | None = None) -> Tensor:
         """Log density of the latent coordinates z."""
         factor = torch.linalg.cholesky(self.covariance)
         log_det = 2 * factor.diagonal().log().sum()
         constant = self.shape["components"] * math.log(2 * math.pi)
-        return -0.5 * (self.penalty(displacement) + log_det + constant)
+        return -0.5 * (self.mahalanobis(displacement) + log_det + constant)
 
-    def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self,
+        count: int,
+        generator: torch.Generator | None = None,
+        source: Tensor | None = None,
+    ) -> Tensor:
         noise = torch.randn(
             count, self.shape["components"], generator=generator, dtype=self.mean.dtype
         ).to(self.mean.device)
@@ -129,3 +180,24 @@ class PCAPrior(Prior):
     def modes(self) -> np.ndarray:
         """Displacement per unit of each latent coordinate: (n_c, N, 3)."""
         return (self.basis * self.scale).view(-1, self.shape["points"], 3).numpy()
+
+    def gaussian(self, source: np.ndarray) -> LinearGaussian:
+        """Mean μ and modes σ ⊙ VL with Σ_reg = LLᵀ; the source (N, 3) only has to fit in length.
+
+        Raises:
+            DataError: the source has another number of points than the fields of the fit.
+        """
+        points = self.shape["points"]
+        if len(source) != points:
+            raise DataError(
+                f"The PCA prior was fitted to fields of {points} points; found a source of "
+                f"{len(source)}."
+            )
+        mean, scale, basis, covariance = (
+            tensor.detach().cpu().numpy().astype(np.float64)
+            for tensor in (self.mean, self.scale, self.basis, self.covariance)
+        )
+        modes = scale * (np.linalg.cholesky(covariance).T @ basis)
+        return LinearGaussian(
+            mean.reshape(points, 3), modes.reshape(-1, points, 3), np.zeros((points, 0))
+        )

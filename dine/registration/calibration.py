@@ -12,21 +12,17 @@ import torch
 from dine.data.batch import make_batch
 from dine.data.pairs import PairSet, read_seen
 from dine.errors import DataError
+from dine.evaluation.quality import fit, folding
 from dine.files import file_digest, read_json, write_json
-from dine.models.backbones import Backbone
-from dine.models.belief_propagation import marginal_variance
+from dine.models.backbones import Backbone, marginal_deviation
 from dine.models.checkpoint import load_backbone
 from dine.priors import Prior, load_prior
 from dine.progress import Progress
-from dine.registration.quality import fit, folding
-from dine.registration.refine import ROUNDS, refine
+from dine.registration.refine import ROUNDS, expected_error, refine
 
 CALIBRATION_FORMAT = "dine-calibration"
 _BINS = 20
 _LIKELY = 90
-# Standard deviations to refine with: at the least, and of a backbone without marginals.
-_LEAST_ERROR = 0.03
-_UNKNOWN = 0.05
 
 
 @dataclass(frozen=True)
@@ -118,15 +114,10 @@ def find_field(
     batch = make_batch([source], [target]).to(device)
     result = backbone.to(device).eval()(batch)
     found = result.displacement[0].double().cpu().numpy()
-    if result.belief is None:
-        error = np.full(len(found), _UNKNOWN)
-        return (refine(source, target, found, error, rounds=rounds) if rounds else found), None
-    temperature = backbone.arguments.get("temperature", 50.0)
-    variance = marginal_variance(result.candidates, result.belief, result.displacement, temperature)
-    spread = variance[0].double().clamp_min(0).sqrt().cpu().numpy()
+    deviation = marginal_deviation(backbone, result)
+    spread = None if deviation is None else deviation[0].double().cpu().numpy()
     if rounds:
-        error = np.maximum(spread, _LEAST_ERROR)
-        found = refine(source, target, found, error, rounds=rounds)
+        found = refine(source, target, found, expected_error(spread, len(found)), rounds=rounds)
     return found, spread
 
 

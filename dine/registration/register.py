@@ -17,6 +17,7 @@ from dine.data.readers import read_surface
 from dine.data.sampling import SurfaceSamples, convention_order, sample_surface
 from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
+from dine.evaluation.quality import distances, fit, folding, landmark_errors
 from dine.files import file_digest
 from dine.models.checkpoint import load_backbone
 from dine.priors import load_prior
@@ -28,7 +29,6 @@ from dine.registration.calibration import (
 )
 from dine.registration.carry import carry
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
-from dine.registration.quality import distances, fit, folding, landmark_errors
 from dine.registration.refine import ROUNDS, refine
 from dine.registration.trust import Trust, assess
 from dine.training.parallel import chosen_device

@@ -425,6 +425,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
         "grad_norm": "Gradient norm",
         "val_cd": "Validation Chamfer distance",
         "val_mce": "Validation correspondence error",
+        "val_roughness": "Validation roughness",
     }
     names = list(dict.fromkeys(name for frame in histories.values() for name in frame))
     columns = [
@@ -534,5 +535,32 @@ def pca_modes_figure(
             axes.set_title(f"Mode {mode + 1}, {'+' if sign > 0 else '−'}2 sd", fontsize=10)
     figure.colorbar(
         ScalarMappable(norm, "viridis"), ax=panels, shrink=0.6, label="Displacement by the mode"
+    )
+    return figure
+
+
+def prior_samples_figure(
+    source: np.ndarray, samples: np.ndarray, title: str, origin: str
+) -> Figure:
+    """A source (N, 3) moved by fields (S, N, 3) that were drawn from a prior."""
+    centre, rotation = _principal_frame(source)
+    lengths = np.linalg.norm(samples, axis=2)
+    # A prior with heavy tails must not hide what most of its points do.
+    norm = Normalize(0, float(np.quantile(lengths, 0.98)) or 1.0)
+    base = (source - centre) @ rotation
+    limits = _cube(np.concatenate([base * 1.3, base]))
+    count = len(samples)
+    figure = _new(3.1 * (count + 1) + 0.8, 3.4, title, origin, "Left: the source as it is.")
+    panels = figure.subplots(1, count + 1, subplot_kw={"projection": "3d"})
+    fields = [np.zeros_like(source), *samples]
+    for number, (axes, field) in enumerate(zip(panels, fields, strict=True)):
+        _bare_axes(axes, limits)
+        colour = np.linalg.norm(field, axis=1)
+        axes.scatter(
+            *(base + field @ rotation).T, s=5, c=colour, cmap="viridis", norm=norm, linewidth=0
+        )
+        axes.set_title("Source" if number == 0 else f"Sample {number}", fontsize=10)
+    figure.colorbar(
+        ScalarMappable(norm, "viridis"), ax=list(panels), shrink=0.7, label="Displacement"
     )
     return figure

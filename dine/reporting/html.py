@@ -67,41 +67,25 @@ def write_report(
     for label, address in (files or {}).items():
         if "://" in address or address.startswith("/"):
             raise DataError(f"The report can link {label} only by a relative path, not {address}.")
-    origins = metrics.drop_duplicates("dataset").set_index("dataset")["origin"]
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("dine.reporting", ""),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     if isinstance(index_agreement, Mapping):
         index_agreement = pd.DataFrame(
             {"Quantity": list(index_agreement), "Value": list(index_agreement.values())}
         )
-    text = environment.get_template("report.html").render(
-        origins=[
-            (
-                display_name(dataset),
-                origin,
-                tables.ORIGIN_NAMES[origin],
-                dataset in tables.DATASET_NAMES,
-            )
-            for dataset, origin in origins.items()
-        ],
+    return render(
+        path,
+        "report.html",
+        origins=origins(metrics),
         findings=findings(metrics),
         overview=_overview(metrics),
-        tables=[_display(table) for table in report_tables],
+        tables=[shown_table(table) for table in report_tables],
         sections=_sections(figures),
         agreement=None if index_agreement is None else _text_frame(index_agreement),
         lambdas=_chosen_lambdas(lambda_searches),
-        config=None if config is None else yaml.safe_dump(dict(config), sort_keys=False),
+        config=as_yaml(config),
         versions=versions or {},
         seconds={name: _duration(value) for name, value in (step_seconds or {}).items()},
         files=files or {},
     )
-    write_text(path, text)
-    return Path(path)
 
 
 # ------------------------------------------------------------------------------- findings
@@ -171,7 +155,40 @@ def _spread(gain: pd.Series) -> str:
 # ------------------------------------------------------------------------------ rendering
 
 
-def _display(table: Table) -> dict[str, Any]:
+def render(path: str | os.PathLike, template: str, **values: Any) -> Path:
+    """Write a page from a template of this folder; all values are escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("dine.reporting", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    write_text(path, environment.get_template(template).render(**values))
+    return Path(path)
+
+
+def origins(metrics: pd.DataFrame) -> list[tuple[str, str, str, bool]]:
+    """For the macro ``banners``: each dataset, its origin, and whether the paper has it."""
+    first = metrics.drop_duplicates("dataset")
+    return [
+        (
+            display_name(dataset),
+            origin,
+            tables.ORIGIN_NAMES[origin],
+            dataset in tables.DATASET_NAMES,
+        )
+        for dataset, origin in zip(first["dataset"], first["origin"], strict=True)
+    ]
+
+
+def as_yaml(config: Mapping[str, Any] | None) -> str | None:
+    """The configuration as it is shown, None where there is none."""
+    return None if config is None else yaml.safe_dump(dict(config), sort_keys=False)
+
+
+def shown_table(table: Table) -> dict[str, Any]:
+    """What the macro ``table`` of parts.html shows."""
     groups = tables.header_groups(table.header)
     return {
         "name": table.name,
@@ -183,19 +200,27 @@ def _display(table: Table) -> dict[str, Any]:
     }
 
 
+def embedded(figure: ReportFigure) -> tuple[str, str, int]:
+    """Caption, PNG in base64 and width in CSS pixels, for the macro ``figure``.
+
+    Raises:
+        DataError: the file is missing or no PNG.
+    """
+    try:
+        data = Path(figure.png).read_bytes()
+    except OSError as error:
+        raise DataError(f"The figure {figure.png} cannot be read; draw it again.") from error
+    # A PNG starts with a signature and its header chunk; bytes 16 to 19 hold the width.
+    if data[:8] != b"\x89PNG\r\n\x1a\n":
+        raise DataError(f"The figure {figure.png} is not a PNG image; draw it again.")
+    width = round(int.from_bytes(data[16:20], "big") * _PIXELS_PER_DOT)
+    return figure.caption, base64.b64encode(data).decode(), width
+
+
 def _sections(figures: Sequence[ReportFigure]) -> dict[str, list[tuple[str, str, int]]]:
     sections: dict[str, list[tuple[str, str, int]]] = {}
     for figure in figures:
-        try:
-            data = Path(figure.png).read_bytes()
-        except OSError as error:
-            raise DataError(f"The figure {figure.png} cannot be read; draw it again.") from error
-        # A PNG starts with a signature and its header chunk; bytes 16 to 19 hold the width.
-        if data[:8] != b"\x89PNG\r\n\x1a\n":
-            raise DataError(f"The figure {figure.png} is not a PNG image; draw it again.")
-        width = round(int.from_bytes(data[16:20], "big") * _PIXELS_PER_DOT)
-        image = base64.b64encode(data).decode()
-        sections.setdefault(figure.section, []).append((figure.caption, image, width))
+        sections.setdefault(figure.section, []).append(embedded(figure))
     return sections
 
 

@@ -43,7 +43,12 @@ ORIGIN_NAMES = {
     "doi": "published data",
 }
 # The paper's order: its Table 3 lists outliers before noise.
-CONDITION_NAMES = {"deformation": "Deformation", "outliers": "Outliers", "noise": "Noise"}
+CONDITION_NAMES = {
+    "deformation": "Deformation",
+    "outliers": "Outliers",
+    "noise": "Noise",
+    "resampled": "Resampled target",
+}
 CORRUPTIONS = ("outliers", "noise")
 BASELINES = ("stage1", "lambda0")
 
@@ -465,7 +470,7 @@ def all_tables(metrics: pd.DataFrame) -> list[Table]:
     for dataset in sorted(metrics["dataset"].unique(), key=lambda name: rank(name, DATASET_NAMES)):
         rows = metrics[metrics["dataset"] == dataset]
         corrupted = rows["condition"].isin(CORRUPTIONS)
-        if not corrupted.all():
+        if (rows["condition"] == "deformation").any():
             tables.append(deformation_table(dataset, rows))
         if corrupted.any():
             tables.append(corruption_table(dataset, rows))
@@ -544,6 +549,8 @@ def _setting_label(condition: str, corruption: float, level: float) -> tuple[str
         return "Outliers", f"{corruption:g} %"
     if condition == "noise":
         return "Noise", f"σ = {corruption:g}"
+    if condition != "deformation":
+        return CONDITION_NAMES.get(condition, condition), _DASH
     return "Deformation", "not given" if np.isnan(level) else f"{level:g}"
 
 

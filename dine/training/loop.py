@@ -24,6 +24,7 @@ from dine.config import Training, check_shares
 from dine.data.loading import Batches, Request
 from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
+from dine.evaluation.quality import roughness
 from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import Backbone
@@ -37,7 +38,7 @@ log = logging.getLogger(__name__)
 STATE = "state.pt"
 MEASURED = ("loss", "data", "penalty", "grad_norm")
 HISTORY_COLUMNS = ("step", *MEASURED, "learning_rate", "seconds")
-VALIDATION_COLUMNS = ("val_cd", "val_mce")
+VALIDATION_COLUMNS = ("val_cd", "val_mce", "val_roughness")
 
 
 def order_of(step: int, batch_size: int, count: int, seed: int) -> np.ndarray:
@@ -72,18 +73,21 @@ def spread(count: int, wanted: int) -> np.ndarray:
 
 @torch.no_grad()
 def validate(backbone: Backbone, batches: Batches, wanted: int) -> dict[str, float]:
-    """Mean Chamfer distance and correspondence error over some validation pairs."""
+    """Mean Chamfer distance, correspondence error and roughness over some validation pairs."""
     backbone.eval()
     values = []
+    rough = []
     requests = (([index], [(1, index)]) for index in spread(len(batches), wanted))
     for batch, truth in batches.stream(requests):
         displacement = backbone(batch).displacement
         distance = chamfer_distance(batch.source + displacement, batch.target)
         error = (displacement - truth).norm(dim=-1)
         values.append(torch.stack([distance.mean(), error.mean()]))
+        points, field = (x[0].double().cpu().numpy() for x in (batch.source, displacement))
+        rough.append(roughness(points, field))
     backbone.train()
     distance, error = np.mean(torch.stack(values).tolist(), axis=0).tolist()
-    return {"val_cd": distance, "val_mce": error}
+    return {"val_cd": distance, "val_mce": error, "val_roughness": float(np.mean(rough))}
 
 
 def history_csv(history: list[dict[str, Any]]) -> str:

@@ -8,43 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from dine.data.batch import Batch
-from dine.errors import ConfigError
-from dine.geometry.chamfer import chamfer_distance, masked_mean
 from dine.models.backbones import Backbone
 from dine.priors.base import Prior
-from dine.registry import Registry
-
-DATA_TERMS: Registry[DataTerm] = Registry("data term")
-
-
-class DataTerm:
-    """Measures how well a displaced source fits; callable, giving one value per pair."""
-
-    registered_name: str
-
-    def __call__(self, batch: Batch, displacement: Tensor, truth: Tensor | None) -> Tensor:
-        """(B, N, 3) predicted and, where known, true displacement to (B,)."""
-        raise NotImplementedError
-
-
-@DATA_TERMS.register("chamfer")
-class Chamfer(DataTerm):
-    """Symmetric squared Chamfer distance between moved source and target (the paper's L_CD)."""
-
-    def __call__(self, batch: Batch, displacement: Tensor, truth: Tensor | None) -> Tensor:
-        return chamfer_distance(
-            batch.source + displacement, batch.target, batch.source_mask, batch.target_mask
-        )
-
-
-@DATA_TERMS.register("l1")
-class TrueDisplacement(DataTerm):
-    """Mean absolute error of the displacement's coordinates; needs the true displacement."""
-
-    def __call__(self, batch: Batch, displacement: Tensor, truth: Tensor | None) -> Tensor:
-        if truth is None:
-            raise ConfigError("The data term 'l1' needs pairs with a known true displacement.")
-        return masked_mean((displacement - truth).abs().mean(-1), batch.source_mask)
+from dine.training.data_terms import DataTerm
 
 
 @dataclass(frozen=True)
@@ -68,7 +34,7 @@ class Objective:
         data = self.data_term(batch, displacement, truth).mean()
         if self.prior is None or self.weight == 0:
             return data, data.detach(), torch.zeros_like(data)
-        penalty = self.prior.penalty(displacement, batch.source_mask).mean()
+        penalty = self.prior.penalty(displacement, batch.source_mask, source=batch.source).mean()
         return data + self.weight * penalty, data.detach(), penalty.detach()
 
 

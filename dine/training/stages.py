@@ -6,9 +6,8 @@ import contextlib
 import logging
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import h5py
 import numpy as np
 import torch
 
@@ -22,18 +21,19 @@ from dine.config import (
     Training,
     check_arguments,
 )
-from dine.data.fields import FIELDS_FORMAT, put_fields, read_fields
+from dine.data.fields import TrainingFields, read_fields, write_training_fields
 from dine.data.loading import Batches
 from dine.data.pairs import PairSet, read_seen
 from dine.errors import CheckpointError, ConfigError, DataError
-from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
-from dine.models.backbones import BACKBONES, Backbone
+from dine.files import digest, file_digest, read_json, write_json, write_text
+from dine.models.backbones import BACKBONES, Backbone, marginal_deviation
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.priors import PRIORS, load_prior
 from dine.progress import Progress
 from dine.provenance import code_digest, run_record
-from dine.training.loop import history_csv, train
-from dine.training.objective import DATA_TERMS, Objective
+from dine.training.data_terms import DATA_TERMS
+from dine.training.loop import VALIDATION_COLUMNS, history_csv, train
+from dine.training.objective import Objective
 from dine.training.parallel import chosen_device
 
 log = logging.getLogger(__name__)
@@ -225,6 +225,18 @@ def pretrain(
     )
 
 
+class Fields(NamedTuple):
+    """Displacement (P, N, 3) float32 of some pairs, normalised frame.
+
+    With the standard deviation (P, N) of the marginals, where the backbone has them, and the wall
+    time (P,) of each pair's batch, shared out.
+    """
+
+    displacement: np.ndarray
+    spread: np.ndarray | None
+    seconds: np.ndarray
+
+
 @torch.no_grad()
 def predict_fields(
     backbone: Backbone,
@@ -234,8 +246,8 @@ def predict_fields(
     batch_size: int = 4,
     compute: Compute = COMPUTE,
     targets: np.ndarray | None = None,
-) -> np.ndarray:
-    """Displacement fields of all pairs, (P, N, 3) float32, in the pairs' order.
+) -> Fields:
+    """Displacement fields of all pairs, in the pairs' order.
 
     ``targets`` (P, M, 3) stands in for the clean targets. Each target's points come in a shuffled
     order, as in training.
@@ -245,14 +257,22 @@ def predict_fields(
     backbone.to(device).eval()
     batches = Batches(pairs, device, targets)
     fields = np.empty(pairs.source.shape, np.float32)
+    spread = np.full(pairs.source.shape[:2], np.nan, np.float32)
+    seconds = np.empty(len(pairs))
     starts = range(0, len(pairs), batch_size)
     parts = [np.arange(start, min(start + batch_size, len(pairs))) for start in starts]
     stream = batches.stream((part, [(2, index) for index in part]) for part in parts)
     with contextlib.closing(stream), Progress(name, len(pairs), unit="pair") as progress:
         for part, (batch, _) in zip(parts, stream, strict=True):
-            fields[part] = backbone(batch).displacement.cpu().numpy()
+            began = time.perf_counter()
+            found = backbone(batch)
+            fields[part] = found.displacement.cpu().numpy()
+            deviation = marginal_deviation(backbone, found)
+            if deviation is not None:
+                spread[part] = deviation.cpu().numpy()
+            seconds[part] = (time.perf_counter() - began) / len(part)
             progress.update(len(part))
-    return fields
+    return Fields(fields, None if np.isnan(spread).any() else spread, seconds)
 
 
 def dump_fields(
@@ -274,9 +294,13 @@ def dump_fields(
     fields = predict_fields(
         backbone, train_pairs, name=name, batch_size=batch_size, compute=compute, targets=seen
     )
-    with atomic_path(out) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(format=FIELDS_FORMAT, model=file_digest(model), pairs=file_digest(pairs))
-        put_fields(file, train_pairs.name, fields)
+    write_training_fields(
+        out,
+        train_pairs.name,
+        TrainingFields(fields.displacement, train_pairs.source, train_pairs.displacement),
+        model=file_digest(model),
+        pairs=file_digest(pairs),
+    )
 
 
 def fit_prior(fields: list[Path], prior: PriorConfig, *, seed: int, out: Path) -> None:
@@ -284,11 +308,18 @@ def fit_prior(fields: list[Path], prior: PriorConfig, *, seed: int, out: Path) -
     arguments = check_arguments(prior)
     began = time.monotonic()
     parts = [read_fields(path) for path in fields]
-    if len({part.shape[1] for part in parts}) > 1:
+    if len({part.source.shape[1] for part in parts}) > 1:
         raise DataError("The files of fields hold different numbers of points; fit one at a time.")
-    fitted = PRIORS.get(prior.kind).fit(np.concatenate(parts), seed=seed, **arguments)
+    source = np.concatenate([part.source for part in parts])
+    chosen = [part.true if prior.fields == "exact" else part.displacement for part in parts]
+    displacement = np.concatenate(chosen)
+    if prior.fields == "shuffled":
+        order = np.tile(np.arange(displacement.shape[1]), (len(displacement), 1))
+        order = np.random.default_rng([6, seed]).permuted(order, axis=1)
+        displacement = np.take_along_axis(displacement, order[..., None], axis=1)
+    fitted = PRIORS.get(prior.kind).fit(displacement, seed=seed, source=source, **arguments)
     digests = [file_digest(path) for path in fields]
-    fitted.save(out, arguments=arguments, fields=digests, seed=seed)
+    fitted.save(out, arguments=arguments, fields=digests, fitted_to=prior.fields, seed=seed)
     log.info("fitted the %s prior in %.1f s", prior.kind, time.monotonic() - began)
 
 
@@ -319,10 +350,12 @@ def stage2(
     name: str,
     compute: Compute = COMPUTE,
 ) -> None:
-    """Refine a Stage-1 model with λ times a frozen prior; ``lambda0`` is the control without."""
-    if (prior is None) != (variant == CONTROL):
-        fault = "needs a prior" if prior is None else "takes no prior"
-        raise ConfigError(f"The variant {variant!r} {fault}.")
+    """Refine a Stage-1 model with λ times a frozen prior.
+
+    ``lambda0`` is the control without; other variants without a prior differ in the data term.
+    """
+    if variant == CONTROL and prior is not None:
+        raise ConfigError(f"The variant {variant!r} takes no prior.")
     backbone, facts = load_backbone(model)
     _run(
         backbone,
@@ -355,7 +388,7 @@ def search_lambda(
     out: Path,
     compute: Compute = COMPUTE,
 ) -> None:
-    """Try each λ on a shortened Stage 2; the lowest Chamfer distance on validation pairs wins.
+    """Try each λ on a shortened Stage 2; the lowest mean of the criterion on validation pairs wins.
 
     λ = 0 is trained too, once, for comparison, but never chosen. Each candidate's result is kept,
     so that an interrupted search goes on with the next one.
@@ -368,7 +401,7 @@ def search_lambda(
             "validation_pairs": search.validation_pairs,
         }
     )
-    folder = out.parent / "candidates"
+    folder = out.with_name(f"{out.stem}_candidates")
     curve = []
     runs: list[tuple[str, float]] = [(CONTROL, 0.0)]
     runs += [(prior, weight) for prior in priors for weight in sorted(search.candidates)]
@@ -389,13 +422,12 @@ def search_lambda(
         final = read_json(here / "run.json")["final"]
         # The control is every prior's value at λ = 0.
         for label in priors if prior == CONTROL else (prior,):
-            curve.append(
-                {"prior": label, "lambda": weight, "cd": final["val_cd"], "mce": final["val_mce"]}
-            )
+            errors = {name.removeprefix("val_"): final[name] for name in VALIDATION_COLUMNS}
+            curve.append({"prior": label, "lambda": weight, **errors})
     selected = {}
     for prior in priors:
         tried = [row for row in curve if row["prior"] == prior and row["lambda"] > 0]
-        selected[prior] = min(tried, key=lambda row: row["cd"])["lambda"]
+        selected[prior] = min(tried, key=lambda row: row[search.criterion])["lambda"]
     write_json(
         out,
         {
@@ -403,6 +435,7 @@ def search_lambda(
             "backbone": search.backbone,
             "default": next(iter(priors)),
             "selected": selected,
+            "criterion": search.criterion,
             "curve": curve,
             "steps": search.steps,
             "validation_pairs": search.validation_pairs,

@@ -13,9 +13,14 @@ from dine.errors import ConfigError
 from dine.provenance import code_digest, folder_signature
 from dine.results import (
     Results,
+    backbone_and_seed,
     conditions,
+    evidence_cells,
+    evidence_conditions,
+    evidence_names,
     figure_names,
     pca_priors,
+    replica,
     runs,
     table_names,
 )
@@ -51,12 +56,19 @@ LOGS = RESULTS / "logs"
 BENCHMARKS = RESULTS / "benchmarks"
 
 
+# Matches no name.
+NOTHING = "(?!)"
+
+
 wildcard_constraints:
     dataset="|".join(CONFIG.datasets),
-    backbone="|".join(CONFIG.backbones),
+    # Trainings with other seeds than the configuration's lie in folders of their own.
+    backbone="(?:" + "|".join(CONFIG.every_backbone) + r")(?:/seed\d+)?",
     prior="|".join(CONFIG.priors),
-    run="stage1|stage2/(?:" + "|".join([dine_config.CONTROL, *CONFIG.priors]) + ")",
-    condition="noise|outliers",
+    prior_of_stage2="|".join(CONFIG.priors_of_stage2) or NOTHING,
+    trained="|".join(evidence_names(CONFIG, dine_config.Stage2Method)) or NOTHING,
+    run="stage1|stage2/[a-z0-9_]+",
+    condition="noise|outliers|resampled",
     corruption=r"\d+(?:\.\d+)?",
     shape="primitives|tissue",
 
@@ -101,8 +113,22 @@ def raw_signature(wildcards):
     )
 
 
+def backbone_config(wildcards):
+    return CONFIG.every_backbone[backbone_and_seed(CONFIG, wildcards.backbone)[0]]
+
+
+def training_seed(wildcards):
+    return backbone_and_seed(CONFIG, wildcards.backbone)[1]
+
+
+def stage1_settings(wildcards):
+    start = backbone_config(wildcards).start
+    changes = {"start": start} if start else {}
+    return section(CONFIG.stage1.model_copy(update=changes))
+
+
 def backbone_settings(wildcards):
-    backbone = CONFIG.backbones[wildcards.backbone]
+    backbone = backbone_config(wildcards)
     return json.dumps(
         {"kind": backbone.kind, "arguments": backbone.arguments}, sort_keys=True
     )
@@ -111,7 +137,11 @@ def backbone_settings(wildcards):
 def prior_settings(wildcards):
     prior = CONFIG.priors[wildcards.prior]
     return json.dumps(
-        {"kind": prior.kind, "arguments": dine_config.check_arguments(prior)},
+        {
+            "kind": prior.kind,
+            "arguments": dine_config.check_arguments(prior),
+            "fields": prior.fields,
+        },
         sort_keys=True,
     )
 
@@ -133,5 +163,204 @@ def calibrating_prior(wildcards):
     """The backbone's first PCA prior, if any: what the trust score measures fields with."""
     return [
         FILES.prior(wildcards.dataset, wildcards.backbone, prior)
-        for prior in pca_priors(CONFIG, wildcards.backbone)[:1]
+        for prior in pca_priors(
+            CONFIG, backbone_and_seed(CONFIG, wildcards.backbone)[0]
+        )[:1]
     ]
+
+
+# --- evidence: a method's files depend on what the configuration says of it ---
+
+
+def is_synthetic(dataset):
+    return CONFIG.datasets[dataset].source.kind == "synthetic"
+
+
+def evidence_raw_settings(wildcards):
+    recipe = CONFIG.datasets[wildcards.dataset].recipe
+    points = CONFIG.datasets[wildcards.dataset].pairs.points
+    recipe = recipe.model_copy(update={"objects": CONFIG.evidence.test_objects})
+    return json.dumps(
+        {"recipe": recipe.model_dump(), "pairs": {"points": points}}, sort_keys=True
+    )
+
+
+def evidence_raw_file(wildcards):
+    if is_synthetic(wildcards.dataset):
+        return FILES.evidence(wildcards.dataset, "raw.json")
+    return FILES.dataset(wildcards.dataset, "raw.json")
+
+
+def evidence_pairs_file(wildcards):
+    """Objects of their own where data are synthetic, otherwise the dataset's test split."""
+    if is_synthetic(wildcards.dataset):
+        return FILES.evidence(wildcards.dataset, "pairs.h5")
+    return FILES.dataset(wildcards.dataset, "pairs.h5")
+
+
+def evidence_variants(wildcards):
+    return [
+        FILES.evidence(wildcards.dataset, "variants", f"{condition}_{level:g}.h5")
+        for condition, level in evidence_conditions(CONFIG)
+    ]
+
+
+def evidence_model(wildcards):
+    folder = replica(CONFIG, wildcards.cell_backbone, int(wildcards.seed))
+    return FILES.run(wildcards.dataset, folder, wildcards.network, "model.safetensors")
+
+
+def searched_prior(wildcards):
+    prior = CONFIG.evidence.methods[wildcards.trained].prior
+    search = CONFIG.lambda_search
+    return FILES.prior(search.dataset, search.backbone, prior)
+
+
+def method_inputs(wildcards):
+    """The prior of a Stage-2 method, and the search of its λ unless that is given."""
+    method = CONFIG.evidence.methods[wildcards.trained]
+    found = {}
+    if method.prior:
+        found["prior"] = FILES.prior(
+            wildcards.dataset, wildcards.backbone, method.prior
+        )
+        if method.weight is None:
+            found["weight"] = FILES.evidence("lambda", f"{wildcards.trained}.json")
+    return found
+
+
+def method_prior_options(wildcards, input):
+    method = CONFIG.evidence.methods[wildcards.trained]
+    if not method.prior:
+        return ""
+    weight = input.weight if method.weight is None else method.weight
+    return shlex.join(["--prior", str(input.prior), "--lambda", str(weight)])
+
+
+def method_stage2(wildcards):
+    data_term = CONFIG.evidence.methods[wildcards.trained].data_term
+    return section(CONFIG.stage2.model_copy(update={"data_term": data_term}))
+
+
+def evidence_search(wildcards):
+    search = CONFIG.lambda_search
+    named = {"dataset": search.dataset, "backbone": search.backbone}
+    choice = CONFIG.evidence.choice.model_dump()
+    return json.dumps(
+        {**named, **choice, "priors": [wildcards.trained]}, sort_keys=True
+    )
+
+
+def refined_inputs(wildcards):
+    method = CONFIG.evidence.methods[wildcards.refined]
+    found = {
+        "predictions": FILES.evidence(
+            wildcards.dataset,
+            wildcards.cell_backbone,
+            f"seed{wildcards.seed}",
+            method.of,
+            "predictions.h5",
+        )
+    }
+    if method.prior:
+        folder = replica(CONFIG, wildcards.cell_backbone, int(wildcards.seed))
+        found["prior"] = FILES.prior(wildcards.dataset, folder, method.prior)
+    return found
+
+
+def refined_prior_options(wildcards, input):
+    return (
+        options("--prior", [input.prior])
+        if CONFIG.evidence.methods[wildcards.refined].prior
+        else ""
+    )
+
+
+def group_cells(wildcards):
+    group = (wildcards.dataset, wildcards.group, int(wildcards.seed))
+    return [cell for cell in evidence_cells(CONFIG) if cell[:3] == group]
+
+
+def group_predictions(wildcards):
+    return [
+        FILES.evidence(
+            cell.dataset,
+            cell.backbone,
+            f"seed{cell.seed}",
+            cell.method,
+            "predictions.h5",
+        )
+        for cell in group_cells(wildcards)
+    ]
+
+
+def group_options(wildcards, input):
+    methods = [cell.method for cell in group_cells(wildcards)]
+    return (
+        options("--method", methods) + " " + options("--predictions", input.predictions)
+    )
+
+
+def evidence_metrics():
+    groups = dict.fromkeys(cell[:3] for cell in evidence_cells(CONFIG))
+    return [
+        FILES.evidence(dataset, backbone, f"seed{seed}", "metrics.csv")
+        for dataset, backbone, seed in groups
+    ]
+
+
+def evidence_searches():
+    searched = [
+        name
+        for name in evidence_names(CONFIG, dine_config.Stage2Method)
+        if CONFIG.evidence.methods[name].prior
+        and CONFIG.evidence.methods[name].weight is None
+    ]
+    return [FILES.search] + [
+        FILES.evidence("lambda", f"{name}.json") for name in searched
+    ]
+
+
+def evidence_diagnostics():
+    """Every prior of the evidence, on every dataset, for the backbone of the search."""
+    used = set(CONFIG.priors_of_stage2)
+    for method in CONFIG.evidence.methods.values():
+        used |= {getattr(method, "prior", None)} - {None}
+    return [
+        FILES.evidence(
+            "diagnostics", dataset, CONFIG.lambda_search.backbone, f"{prior}.json"
+        )
+        for dataset in CONFIG.datasets
+        for prior in CONFIG.priors
+        if prior in used
+    ]
+
+
+def evidence_method_texts():
+    """Title, group and description of every method, for the report."""
+    known = {
+        dine_config.STAGE1: {
+            "title": "Stage 1",
+            "group": "network",
+            "description": "The network trained on the Chamfer distance alone.",
+        },
+        dine_config.CONTROL: {
+            "title": "Control (λ = 0)",
+            "group": "network",
+            "description": "Stage 2 without a prior: same start, steps and seed.",
+        },
+    }
+    for prior in CONFIG.priors_of_stage2:
+        kind = CONFIG.priors[prior].kind
+        known[prior] = {
+            "title": f"DINE-{ {'pca': 'PCA', 'flow': 'Flow'}.get(prior, prior) }",
+            "group": "prior",
+            "description": f"Stage 2 with the prior {kind}, and the λ of the search for `all`.",
+        }
+    for name, method in CONFIG.evidence.methods.items():
+        known[name] = {
+            "title": method.title or name,
+            "group": method.group,
+            "description": method.description,
+        }
+    return json.dumps(known, sort_keys=True)

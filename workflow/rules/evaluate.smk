@@ -21,7 +21,7 @@ rule predict:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=code_digest("model"),
+        code=code_digest("model", "evaluation"),
     shell:
         "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
         " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
@@ -46,9 +46,10 @@ rule evaluate:
     params:
         variants=variant_options,
         method=lambda wildcards: wildcards.run.removeprefix("stage2/"),
+        seed=CONFIG.seed,
         code=code_digest("evaluation"),
     shell:
         "dine --log {log:q} evaluate --predictions {input.predictions:q} --pairs {input.pairs:q}"
         " {params.variants} --dataset {wildcards.dataset} --backbone {wildcards.backbone}"
-        " --method {params.method} --point-errors {output.point_errors:q}"
+        " --method {params.method} --seed {params.seed} --point-errors {output.point_errors:q}"
         " --out {output.metrics:q}"

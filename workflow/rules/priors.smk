@@ -16,7 +16,7 @@ rule fit_prior:
     threads: THREADS
     params:
         settings=prior_settings,
-        seed=CONFIG.seed,
+        seed=training_seed,
         code=code_digest("priors"),
     shell:
         "dine --log {log:q} --threads {threads} fit-prior --fields {input:q}"

@@ -21,8 +21,8 @@ rule stage1:
         processes=PROCESSES,
     params:
         backbone=backbone_settings,
-        settings=section(CONFIG.stage1),
-        seed=CONFIG.seed,
+        settings=stage1_settings,
+        seed=training_seed,
         compute=COMPUTE,
         code=code_digest("model", "training"),
     shell:

@@ -19,7 +19,7 @@ rule stage2_control:
         processes=PROCESSES,
     params:
         settings=section(CONFIG.stage2),
-        seed=CONFIG.seed,
+        seed=training_seed,
         compute=COMPUTE,
         code=code_digest("model", "training"),
     shell:
@@ -34,14 +34,18 @@ rule stage2_prior:
     input:
         pairs=rules.pairs.output,
         model=rules.stage1.output.model,
-        prior=rules.fit_prior.output,
+        prior=RESULTS
+        / "{dataset}"
+        / "{backbone}"
+        / "priors"
+        / "{prior_of_stage2}.safetensors",
         weight=rules.search_lambda.output,
     output:
-        **stage2_outputs("{prior}"),
+        **stage2_outputs("{prior_of_stage2}"),
     log:
-        LOGS / "{dataset}" / "{backbone}" / "stage2" / "{prior}.log",
+        LOGS / "{dataset}" / "{backbone}" / "stage2" / "{prior_of_stage2}.log",
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "{prior}.tsv"
+        BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "{prior_of_stage2}.tsv"
     conda:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
@@ -50,13 +54,13 @@ rule stage2_prior:
         processes=PROCESSES,
     params:
         settings=section(CONFIG.stage2),
-        seed=CONFIG.seed,
+        seed=training_seed,
         compute=COMPUTE,
         code=code_digest("model", "priors", "training"),
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
-        " --model {input.model:q} --variant {wildcards.prior} --prior {input.prior:q}"
+        " --model {input.model:q} --variant {wildcards.prior_of_stage2} --prior {input.prior:q}"
         " --lambda {input.weight:q} --settings {params.settings:q} --seed {params.seed}"
         " {params.compute} --processes {resources.processes}"
-        " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior}'"
+        " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior_of_stage2}'"
         ' --out "$(dirname {output.model:q})"'

@@ -24,7 +24,14 @@ class VectorGaussian(Prior):
         self.register_buffer("factor", torch.eye(3))
 
     @classmethod
-    def fit(cls, fields: np.ndarray, *, seed: int = 0, epsilon: float = 1e-6) -> Self:
+    def fit(
+        cls,
+        fields: np.ndarray,
+        *,
+        seed: int = 0,
+        source: np.ndarray | None = None,
+        epsilon: float = 1e-6,
+    ) -> Self:
         """Fit to (K, N, 3) fields; ``epsilon`` is added to the covariance's diagonal."""
         fields = check_fields(fields)
         vectors = fields.reshape(-1, 3)
@@ -40,13 +47,20 @@ class VectorGaussian(Prior):
         offset = (displacement - self.mean).transpose(1, 2)
         return torch.linalg.solve_triangular(self.factor, offset, upper=False).square().sum(1)
 
-    def penalty(self, displacement: Tensor, mask: Tensor | None = None) -> Tensor:
+    def penalty(
+        self, displacement: Tensor, mask: Tensor | None = None, source: Tensor | None = None
+    ) -> Tensor:
         return masked_mean(self._squared(displacement), mask)
 
-    def log_prob(self, displacement: Tensor) -> Tensor:
+    def log_prob(self, displacement: Tensor, source: Tensor | None = None) -> Tensor:
         constant = 1.5 * math.log(2 * math.pi) + self.factor.diagonal().log().sum()
         return -(0.5 * self._squared(displacement) + constant).sum(-1)
 
-    def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self,
+        count: int,
+        generator: torch.Generator | None = None,
+        source: Tensor | None = None,
+    ) -> Tensor:
         noise = torch.randn(count, self.shape["points"], 3, generator=generator).to(self.mean)
         return self.mean + noise @ self.factor.T

@@ -4,7 +4,7 @@ from torch import Tensor
 
 from dine.data.batch import Batch
 from dine.geometry.chamfer import masked_mean, nearest_squared
-from dine.training.objective import DataTerm
+from dine.training.data_terms import DataTerm
 
 
 class PartialTarget(DataTerm):

@@ -1,0 +1,444 @@
+"""Whether a difference between two methods is more than chance: paired tests and intervals.
+
+All functions take the rows of one or more ``metrics.csv`` in one frame. Values are averaged over
+training seeds first, so that a pair counts once however often a method was trained; what the seeds
+differ by is reported beside. Definitions and sources: docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+from dine.errors import DataError
+from dine.evaluation.quality import FAILURE
+from dine.results import NO_BACKBONE
+
+SUMMARISED = (
+    *("cd", "mce", "hd95", "accuracy_2_5", "accuracy_5", "far_points"),
+    *("folding", "roughness", "seconds"),
+)
+"""Metrics of ``summary``, which adds the failure rate."""
+
+_GROUP = ["dataset", "backbone", "condition", "corruption"]
+_PAIR = ["pair", "object", "level"]
+_NEEDED = ["dataset", "backbone", "method", "seed", *_PAIR, "condition", "corruption"]
+# Levels and corruptions that passed through float32 must still meet; real ones lie far apart.
+_DECIMALS = 6
+
+
+# ----------------------------------------------------------------------------- small functions
+
+
+def holm(p: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Adjusted p-values (m,) of m tests that hold together with their family-wise error rate.
+
+    In increasing order, p̃_(i) = max over j ≤ i of min(1, (m − j + 1) p_(j)). NaN stays NaN and
+    does not count as a test. Holm (1979), Scandinavian Journal of Statistics 6.
+    """
+    p = np.asarray(p, dtype=float)
+    adjusted = np.full(p.shape, np.nan)
+    tests = np.flatnonzero(~np.isnan(p))
+    order = tests[np.argsort(p[tests], kind="stable")]
+    steps = p[order] * np.arange(len(order), 0, -1)
+    adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1)
+    return adjusted
+
+
+def rank_biserial(differences: np.ndarray) -> float:
+    """Matched-pairs rank-biserial correlation of (P,) differences, from −1 to 1.
+
+    (W₊ − W₋) / (W₊ + W₋) with W₊ and W₋ the sums of the ranks of |d| over positive and negative
+    differences; zeros are left out, as in Wilcoxon's test, and 0 is returned where nothing remains.
+    −1: all differences are negative. Kerby (2014), Comprehensive Psychology 3.
+    """
+    differences = np.asarray(differences, dtype=float)
+    differences = differences[differences != 0]
+    if len(differences) == 0:
+        return 0.0
+    ranks = stats.rankdata(np.abs(differences))
+    return float((np.sign(differences) * ranks).sum() / ranks.sum())
+
+
+def wilcoxon(differences: np.ndarray) -> float:
+    """Two-sided p-value of Wilcoxon's signed-rank test that (P,) differences are symmetric about 0.
+
+    Zeros are left out; 1 where nothing remains. Exact up to 50 differences without ties (and up to
+    13 with), normal approximation corrected for ties otherwise. Wilcoxon (1945), Biometrics
+    Bulletin 1.
+    """
+    differences = np.asarray(differences, dtype=float)
+    differences = differences[differences != 0]
+    if len(differences) == 0:
+        return 1.0
+    return float(stats.wilcoxon(differences).pvalue)
+
+
+def cluster_bootstrap(
+    differences: np.ndarray,
+    clusters: np.ndarray,
+    *,
+    samples: int = 2000,
+    seed: int = 0,
+    confidence: float = 0.95,
+) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean of (P,) differences that belong to clusters (P,).
+
+    Whole clusters are drawn with replacement, as many as there are, because pairs of one object are
+    not independent: pairs drawn one by one would give too narrow an interval. With fewer than two
+    clusters nothing is known about the spread between them, and both ends are NaN.
+    Davison and Hinkley (1997), Bootstrap Methods and their Application, section 3.8.
+    """
+    differences = np.asarray(differences, dtype=float)
+    _, member = np.unique(np.asarray(clusters), return_inverse=True)
+    sizes = np.bincount(member)
+    count = len(sizes)
+    if count < 2:
+        return float("nan"), float("nan")
+    sums = np.bincount(member, weights=differences)
+    # How often each cluster is drawn.
+    drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=samples)
+    means = (drawn @ sums) / (drawn @ sizes)
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(means, [tail, 1 - tail])
+    return float(low), float(high)
+
+
+def mcnemar(a: np.ndarray, b: np.ndarray) -> float:
+    """Exact two-sided p-value that two (P,) boolean outcomes on the same pairs are as frequent.
+
+    Only the pairs count in which the outcomes differ: under the null hypothesis the number of those
+    with ``a`` is binomial with probability ½. 1 where no pair differs. McNemar (1947),
+    Psychometrika 12.
+    """
+    a, b = np.asarray(a, dtype=bool), np.asarray(b, dtype=bool)
+    only_a, only_b = int((a & ~b).sum()), int((b & ~a).sum())
+    if only_a + only_b == 0:
+        return 1.0
+    return float(stats.binomtest(only_a, only_a + only_b, 0.5).pvalue)
+
+
+# ------------------------------------------------------------------------------------ pairing
+
+
+def paired(
+    metrics: pd.DataFrame,
+    method: str,
+    reference: str,
+    value: str,
+    *,
+    backbone: str | None = None,
+) -> pd.DataFrame:
+    """Two methods on the same pairs, within a backbone, each averaged over its seeds.
+
+    A method whose rows have the backbone ``none`` is compared with those of every backbone. What
+    only one of the two was evaluated on (a whole dataset, backbone, condition or corruption) cannot
+    be compared and is left out, as are pairs for which the value is missing for both.
+
+    Args:
+        metrics: rows of ``metrics.csv``.
+        method: the method in question.
+        reference: what it is compared with.
+        value: column to compare, lower or higher being better.
+        backbone: of this backbone only; by default, of all.
+
+    Returns:
+        One row per dataset, backbone, condition, corruption and pair: these, ``object``, ``level``,
+        ``method`` and ``reference`` (the values) and ``difference`` (method − reference), in the
+        unit of the value.
+
+    Raises:
+        DataError: a column is missing, the methods have nothing in common, a pair was evaluated
+            twice, or the two (or two seeds of one) were evaluated on different pairs.
+    """
+    aligned, _ = _aligned(metrics, method, reference, value, backbone)
+    return aligned
+
+
+def _aligned(
+    metrics: pd.DataFrame, method: str, reference: str, value: str, backbone: str | None
+) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
+    """``paired``, and the values of each seed under ``method`` and ``reference``, same groups."""
+    rows = _tidy(metrics, [value])
+    ours, theirs = (rows[rows["method"] == name] for name in (method, reference))
+    for name, found in ((method, ours), (reference, theirs)):
+        if found.empty:
+            raise DataError(f"The metrics hold no rows of the method {name!r}.")
+    backbones = sorted({*ours["backbone"], *theirs["backbone"]} - {NO_BACKBONE}) or [NO_BACKBONE]
+    if backbone is not None:
+        backbones = [name for name in backbones if name == backbone]
+    found, seeds = [], {"method": [], "reference": []}
+    for name in backbones:
+        mine, other = _of_backbone(ours, name), _of_backbone(theirs, name)
+        shared = mine[_GROUP].drop_duplicates().merge(other[_GROUP].drop_duplicates())
+        if shared.empty:
+            continue
+        mine, other = mine.merge(shared), other.merge(shared)
+        found.append(_joined(_over_seeds(mine, value), _over_seeds(other, value), value))
+        seeds["method"].append(mine)
+        seeds["reference"].append(other)
+    if not found:
+        where = "" if backbone is None else f" with the backbone {backbone!r}"
+        raise DataError(
+            f"The methods {method!r} and {reference!r} have no dataset and condition in "
+            f"common{where}."
+        )
+    return (
+        pd.concat(found, ignore_index=True),
+        {name: pd.concat(parts, ignore_index=True) for name, parts in seeds.items()},
+    )
+
+
+def _of_backbone(rows: pd.DataFrame, backbone: str) -> pd.DataFrame:
+    own = rows[rows["backbone"] == backbone]
+    if own.empty:
+        own = rows[rows["backbone"] == NO_BACKBONE].assign(backbone=backbone)
+    return own
+
+
+def _joined(ours: pd.DataFrame, theirs: pd.DataFrame, value: str) -> pd.DataFrame:
+    keys = [*_GROUP, *_PAIR]
+    both = ours[[*keys, "method", value]].merge(
+        theirs[[*keys, "method", value]], on=keys, how="outer", suffixes=("", "_of_reference")
+    )
+    reference = f"{value}_of_reference"
+    alone = both[value].isna() != both[reference].isna()
+    if alone.any():
+        row = both[alone].iloc[0]
+        raise DataError(
+            f"{ours['method'].iloc[0]!r} and {theirs['method'].iloc[0]!r} were evaluated on "
+            f"different pairs of {row['dataset']} ({row['condition']}, {row['backbone']}): "
+            f"{int(alone.sum())} have a {value} of one only, such as {row['pair']!r}."
+        )
+    both = both[both[value].notna()]
+    return both[keys].assign(
+        method=both[value],
+        reference=both[reference],
+        difference=both[value] - both[reference],
+    )
+
+
+def _tidy(metrics: pd.DataFrame, values: Iterable[str]) -> pd.DataFrame:
+    """The columns needed, with keys that meet, or the reason why it cannot be."""
+    values = list(dict.fromkeys(values))
+    missing = [name for name in [*_NEEDED, *values] if name not in metrics]
+    if missing:
+        raise DataError(f"The metrics lack the column(s) {', '.join(missing)}.")
+    keys = {name: metrics[name].astype(float).round(_DECIMALS) for name in ("corruption", "level")}
+    rows = metrics[[*_NEEDED, *values]].assign(**keys)
+    repeated = rows[rows.duplicated([*_GROUP, "method", "seed", "pair"])]
+    if len(repeated):
+        row = repeated.iloc[0]
+        raise DataError(
+            f"The metrics hold the pair {row['pair']!r} of {row['dataset']} twice for "
+            f"{row['method']} with seed {row['seed']}."
+        )
+    return rows
+
+
+def _over_seeds(rows: pd.DataFrame, *values: str) -> pd.DataFrame:
+    """Mean over seeds per pair, with ``seeds``, how many there are."""
+    keys = [*_GROUP, "method"]
+    grouped = rows.groupby([*keys, *_PAIR], dropna=False, sort=False)
+    means = grouped[list(values)].mean().join(grouped["seed"].nunique().rename("seeds"))
+    means = means.reset_index()
+    expected = rows.groupby(keys)["seed"].nunique().rename("expected").reset_index()
+    means = means.merge(expected, on=keys)
+    short = means[means["seeds"] != means["expected"]]
+    if len(short):
+        row = short.iloc[0]
+        raise DataError(
+            f"The seeds of {row['method']} were evaluated on different pairs of {row['dataset']} "
+            f"({row['condition']}, {row['backbone']}): {row['pair']!r} has {row['seeds']} of "
+            f"{row['expected']}."
+        )
+    return means.drop(columns="expected")
+
+
+# --------------------------------------------------------------------------------- comparison
+
+
+def compare(
+    metrics: pd.DataFrame,
+    method: str,
+    reference: str,
+    *,
+    values: Sequence[str] = ("cd", "mce"),
+    samples: int = 2000,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Is a method better than a reference, by how much, and could it be chance?
+
+    One row per dataset, backbone, condition, corruption, deformation level and value, and one of
+    all levels together, whose ``level`` is NaN. Columns beside these:
+
+    - ``method``, ``reference``: the names; ``pairs``, ``objects``: how many; ``seeds_method``,
+      ``seeds_reference``: how many trainings were averaged;
+    - ``mean_method``, ``mean_reference``, ``difference`` (method − reference, in the unit of the
+      value) and ``relative`` (difference in percent of the reference);
+    - ``ci_low``, ``ci_high``: 95 % interval of the difference, see ``cluster_bootstrap``;
+    - ``p``: ``wilcoxon``; ``p_holm``: adjusted by ``holm`` over the levels (and corruptions) of one
+      dataset, backbone, condition and value. Rows of all levels are a family of their own;
+    - ``effect``: ``rank_biserial``, negative where the method is lower;
+      ``win_rate``: share of the pairs in which it is lower, ties half;
+    - ``failures_method``, ``failures_reference``: share of the pairs with a mean correspondence
+      error (over seeds) above 0.1; ``p_failures``: ``mcnemar`` of these;
+    - ``seed_sd_method``, ``seed_sd_reference``: standard deviation (ddof = 1) over seeds of the
+      mean over pairs; NaN with one seed.
+
+    Args:
+        metrics: rows of ``metrics.csv``.
+        method: the method in question.
+        reference: what it is compared with.
+        values: columns to compare.
+        samples: draws of the bootstrap.
+        seed: of the bootstrap.
+
+    Raises:
+        DataError: see ``paired``.
+    """
+    errors, _ = _aligned(metrics, method, reference, "mce", None)
+    # Pairs without known correspondences can neither fail nor succeed: NaN after the merge.
+    failed = errors[[*_GROUP, "pair"]].assign(
+        failed_method=(errors["method"] > FAILURE).astype(float),
+        failed_reference=(errors["reference"] > FAILURE).astype(float),
+    )
+    records = []
+    for value in values:
+        aligned, by_seed = _aligned(metrics, method, reference, value, None)
+        aligned = aligned.merge(failed, on=[*_GROUP, "pair"], how="left")
+        spread = {side: _seed_spread(rows, value) for side, rows in by_seed.items()}
+        for level, rows in _levels(aligned):
+            for key, some in rows.groupby(_GROUP, sort=False):
+                place = (*key, level)
+                records.append(
+                    {
+                        **dict(zip(_GROUP, key, strict=True)),
+                        "level": level,
+                        "value": value,
+                        "method": method,
+                        "reference": reference,
+                        **_difference(some, samples, seed),
+                        **_failures(some),
+                        **{
+                            f"{name}_{side}": found
+                            for side in ("method", "reference")
+                            for name, found in spread[side][_hashable(place)].items()
+                        },
+                    }
+                )
+    if not records:
+        raise DataError(f"No pair has a {' or a '.join(values)} to compare.")
+    table = pd.DataFrame(records)
+    family = [*_GROUP[:-1], "value", table["level"].isna().rename("all")]
+    table.insert(
+        table.columns.get_loc("p") + 1, "p_holm", table.groupby(family)["p"].transform(holm)
+    )
+    order = {value: i for i, value in enumerate(values)}
+    return table.sort_values(
+        [*_GROUP, "value", "level"],
+        key=lambda column: column.map(order) if column.name == "value" else column,
+        kind="stable",
+        ignore_index=True,
+    )
+
+
+def _levels(rows: pd.DataFrame) -> Iterable[tuple[float, pd.DataFrame]]:
+    """Each deformation level with its rows, and NaN with all; pairs may be of no known level."""
+    yield from rows.groupby("level")
+    yield float("nan"), rows
+
+
+def _hashable(key: tuple) -> tuple:
+    """NaN equals no NaN, so it cannot be looked up."""
+    return tuple("all" if isinstance(x, float) and np.isnan(x) else x for x in key)
+
+
+def _difference(rows: pd.DataFrame, samples: int, seed: int) -> dict[str, float]:
+    """The columns of ``compare`` that follow from the aligned values of some pairs."""
+    ours, theirs = rows["method"].mean(), rows["reference"].mean()
+    difference = rows["difference"].to_numpy()
+    low, high = cluster_bootstrap(difference, rows["object"].to_numpy(), samples=samples, seed=seed)
+    return {
+        "pairs": len(rows),
+        "objects": rows["object"].nunique(),
+        "mean_method": ours,
+        "mean_reference": theirs,
+        "difference": difference.mean(),
+        "relative": 100 * difference.mean() / theirs if theirs else np.nan,
+        "ci_low": low,
+        "ci_high": high,
+        "p": wilcoxon(difference),
+        "effect": rank_biserial(difference),
+        "win_rate": (difference < 0).mean() + (difference == 0).mean() / 2,
+    }
+
+
+def _failures(rows: pd.DataFrame) -> dict[str, float]:
+    """The columns of ``compare`` on failures."""
+    known = rows.dropna(subset="failed_method")
+    ours, theirs = known["failed_method"], known["failed_reference"]
+    return {
+        "failures_method": ours.mean(),
+        "failures_reference": theirs.mean(),
+        "p_failures": mcnemar(ours, theirs) if len(known) else np.nan,
+    }
+
+
+def _seed_spread(rows: pd.DataFrame, value: str) -> dict[tuple, dict[str, float]]:
+    """Number of seeds and standard deviation of their means, by group and level."""
+    found = {}
+    for level, some in _levels(rows):
+        means = some.groupby([*_GROUP, "seed"], sort=False)[value].mean()
+        for key, by_seed in means.groupby(level=_GROUP, sort=False):
+            place = _hashable((*key, level))
+            found[place] = {"seeds": len(by_seed), "seed_sd": by_seed.std(ddof=1)}
+    return found
+
+
+def summary(metrics: pd.DataFrame, *, pool_levels: bool = False) -> pd.DataFrame:
+    """Mean and spread of every method by dataset, backbone, condition, corruption and level.
+
+    Values are averaged over seeds per pair first. ``pairs`` and ``seeds`` count; for each metric in
+    ``SUMMARISED``, ``<metric>_mean`` and ``<metric>_sd`` are mean and standard deviation (ddof = 1)
+    over pairs, and ``<metric>_seed_sd`` the standard deviation over seeds of their means over pairs
+    (NaN with one seed). ``mce_pairs_median`` and ``mce_pairs_p95`` are over pairs;
+    ``failure_rate`` is the share of the pairs with an ``mce`` above 0.1, and its
+    ``failure_rate_seed_sd`` that of each seed's own rate. Units are those of the metrics.
+
+    Args:
+        metrics: rows of ``metrics.csv``.
+        pool_levels: all deformation levels together; ``level`` is then NaN.
+
+    Raises:
+        DataError: a column is missing, a pair was evaluated twice, or seeds of one method were
+            evaluated on different pairs.
+    """
+    rows = _tidy(metrics, SUMMARISED)
+    keys = ["dataset", "backbone", "method", "condition", "corruption", "level"]
+    values = [*SUMMARISED, "failure_rate"]
+
+    def with_failures(frame: pd.DataFrame) -> pd.DataFrame:
+        failed = (frame["mce"] > FAILURE).astype(float).where(frame["mce"].notna())
+        frame = frame.assign(failure_rate=failed)
+        return frame.assign(level=np.nan) if pool_levels else frame
+
+    over_pairs = with_failures(_over_seeds(rows, *SUMMARISED)).groupby(keys, dropna=False)
+    by_seed = with_failures(rows).groupby([*keys, "seed"], dropna=False)[values].mean()
+    mean, sd = over_pairs[values].mean(), over_pairs[values].std(ddof=1)
+    seed_sd = by_seed.groupby(level=keys, dropna=False).std(ddof=1)
+    columns = {"pairs": over_pairs.size(), "seeds": over_pairs["seeds"].max()}
+    for name in SUMMARISED:
+        columns |= {f"{name}_mean": mean[name], f"{name}_sd": sd[name]}
+        columns[f"{name}_seed_sd"] = seed_sd[name]
+        if name == "mce":
+            columns["mce_pairs_median"] = over_pairs["mce"].median()
+            columns["mce_pairs_p95"] = over_pairs["mce"].quantile(0.95)
+    columns |= {
+        "failure_rate": mean["failure_rate"],
+        "failure_rate_seed_sd": seed_sd["failure_rate"],
+    }
+    return pd.DataFrame(columns).reset_index()

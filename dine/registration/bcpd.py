@@ -1,0 +1,219 @@
+"""Bayesian coherent point drift, written from its paper, since no kept library has it.
+
+O. Hirose, "A Bayesian Formulation of Coherent Point Drift", IEEE TPAMI 43 (2021). Target points are
+drawn from a mixture of Gaussians around the moved source points T(y + v), plus uniform outliers;
+T is a similarity transform and v a Gaussian process. Variational Bayes alternates between who
+belongs to whom, the posterior of v, and T with the variance of the mixture. Names follow the paper:
+y source, x target, v displacement, u = y + v, ν matches of each source point, σ² of the mixture.
+
+Two things make it fast. The kernel matrix is replaced by a root of low rank, which is all that the
+posterior needs; and once the mixture is narrow, only close pairs of points are compared.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+from scipy.special import digamma
+
+from dine.errors import DataError
+from dine.priors.gaussian import covariance_root
+
+# In standard deviations of the mixture, which weigh e^-18 there, and in units of the source.
+_REACH = 6.0
+_NEAR = 0.3
+_LEAST_MATCHES = 1e-20
+_LEAST_VARIANCE = 1e-12
+
+
+class Similarity(NamedTuple):
+    """points · scale · rotationᵀ + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def inverse(self, points: np.ndarray) -> np.ndarray:
+        return (points - self.translation) @ self.rotation / self.scale
+
+
+class Result(NamedTuple):
+    """What :func:`bcpd` found.
+
+    Attributes:
+        moved: (N, 3) source points where they belong, in the units given.
+        matched: (N,) expected number of target points of each source point.
+        sigma: standard deviation of the mixture at the end, in the units given.
+        iterations: done until nothing changed.
+    """
+
+    moved: np.ndarray
+    matched: np.ndarray
+    sigma: float
+    iterations: int
+
+
+class _Matches(NamedTuple):
+    """Sums of the matching probabilities P (N, M): over targets, over sources, and P x."""
+
+    source: np.ndarray
+    target: np.ndarray
+    pulled: np.ndarray
+
+
+def bcpd(
+    source: np.ndarray,
+    target: np.ndarray,
+    *,
+    beta: float = 2.0,
+    lam: float = 2.0,
+    outliers: float = 0.1,
+    gamma: float = 1.0,
+    kappa: float = math.inf,
+    uncertain: bool = True,
+    rank: int = 300,
+    iterations: int = 500,
+    least_iterations: int = 30,
+    tolerance: float = 1e-4,
+) -> Result:
+    """Register (N, 3) source points to (M, 3) target points.
+
+    Both clouds are first brought to zero mean and unit variance per coordinate, as the author's
+    program does, so ``beta``, ``lam`` and ``tolerance`` mean the same whatever the units.
+
+    Args:
+        source: (N, 3) points to move.
+        target: (M, 3) points; their order does not matter.
+        beta: width of the Gaussian kernel, in standard deviations of the source.
+        lam: λ; displacements have an expected length of √(3 / λ) of these.
+        outliers: ω in [0, 1), the share of target points that belong to no source point.
+        gamma: factor on the standard deviation that the mixture starts with.
+        kappa: concentration of the mixing weights; infinite for equal ones.
+        uncertain: let the posterior variance of v count; otherwise its mean stands for v.
+        rank: most columns of the root of the kernel matrix.
+        iterations: at most.
+        least_iterations: at least; the variance may rest before it falls.
+        tolerance: stop once σ changes less than this.
+
+    Raises:
+        DataError: a cloud whose points coincide.
+    """
+    y, _, _ = _standardised(source, "source")
+    x, center_x, unit_x = _standardised(target, "target")
+    count, dim = y.shape
+    root = covariance_root(y, (beta,), (1.0,), rank=rank, tolerance=1e-6)
+    tree = cKDTree(x)
+    # A box a little larger than the target, since points on its faces would cost nothing.
+    volume = float(np.prod(np.ptp(x, axis=0) * (len(x) + 1) / len(x)))
+    outlier = outliers / max(volume, 1e-9)
+
+    transform = Similarity(1.0, np.eye(dim), np.zeros(dim))
+    moved, spread = y, np.zeros(count)
+    mixing = np.full(count, 1 / count)
+    variance = gamma**2 * float(cdist(y, x, "sqeuclidean").mean()) / dim
+    for iteration in range(1, iterations + 1):
+        # Who belongs to whom.
+        share = (1 - outliers) * mixing / (2 * math.pi * variance) ** (dim / 2)
+        if uncertain:
+            share = share * np.exp(-0.5 * dim * transform.scale**2 * spread / variance)
+        matches = _matched(moved, x, tree, variance, share, outlier)
+        matched = np.maximum(matches.source, _LEAST_MATCHES)
+        total = float(matched.sum())
+        mean_match = matches.pulled / matched[:, None]
+
+        # The posterior of v, whose covariance is root · inverse(system) · rootᵀ.
+        weight = matched * (transform.scale**2 / variance)
+        system = (root * weight[:, None]).T @ root
+        system[np.diag_indices_from(system)] += lam
+        factor = cho_factor(system, lower=True, overwrite_a=True, check_finite=False)
+        residual = weight[:, None] * (transform.inverse(mean_match) - y)
+        u = y + root @ cho_solve(factor, root.T @ residual, check_finite=False)
+        if uncertain:
+            half = solve_triangular(factor[0], root.T, lower=True, check_finite=False)
+            spread = np.einsum("kn,kn->n", half, half)
+        if math.isfinite(kappa):
+            mixing = np.exp(digamma(kappa + matched) - digamma(kappa * count + total))
+
+        # The similarity transform and the variance of the mixture.
+        mean_spread = float(matched @ spread) / total
+        transform = _similarity(u, mean_match, matched, mean_spread)
+        moved = transform(u)
+        misfit = float(
+            matches.target @ (x**2).sum(axis=1)
+            - 2 * (matches.pulled * moved).sum()
+            + matched @ (moved**2).sum(axis=1)
+        )
+        before = variance
+        variance = misfit / (total * dim) + transform.scale**2 * mean_spread
+        variance = max(variance, _LEAST_VARIANCE)
+        resting = abs(math.sqrt(variance) - math.sqrt(before)) < tolerance
+        if resting and iteration >= least_iterations:
+            break
+    return Result(moved * unit_x + center_x, matched, math.sqrt(variance) * unit_x, iteration)
+
+
+def _standardised(points: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """Points of zero mean and unit mean variance, with the mean and the unit taken from them."""
+    points = np.asarray(points, dtype=np.float64)
+    center = points.mean(axis=0)
+    unit = math.sqrt(float(((points - center) ** 2).mean()))
+    if not unit > 0:
+        raise DataError(f"All points of the {what} coincide; expected the surface of an object.")
+    return (points - center) / unit, center, unit
+
+
+def _matched(
+    moved: np.ndarray,
+    x: np.ndarray,
+    tree: cKDTree,
+    variance: float,
+    share: np.ndarray,
+    outlier: float,
+) -> _Matches:
+    """Matches of (N, 3) moved sources, weighted by their shares (N,), and (M, 3) targets."""
+    reach = _REACH * math.sqrt(variance)
+    if reach < _NEAR:
+        near = cKDTree(moved).sparse_distance_matrix(tree, reach, output_type="ndarray")
+        i, j = near["i"], near["j"]
+        density = share[i] * np.exp(near["v"] ** 2 / (-2 * variance))
+        of_target = np.bincount(j, density, len(x)) + outlier
+        probability = density / np.maximum(of_target, np.finfo(float).tiny)[j]
+        pulled = [np.bincount(i, probability * axis[j], len(moved)) for axis in x.T]
+        return _Matches(
+            np.bincount(i, probability, len(moved)),
+            np.bincount(j, probability, len(x)),
+            np.stack(pulled, axis=1),
+        )
+    density = cdist(moved, x, "sqeuclidean")
+    density /= -2 * variance
+    np.exp(density, out=density)
+    density *= share[:, None]
+    of_target = np.maximum(density.sum(axis=0) + outlier, np.finfo(float).tiny)
+    density /= of_target
+    return _Matches(density.sum(axis=1), density.sum(axis=0), density @ x)
+
+
+def _similarity(
+    u: np.ndarray, match: np.ndarray, matched: np.ndarray, mean_spread: float
+) -> Similarity:
+    """The transform of (N, 3) points u onto their mean matches, weighted by ``matched`` (N,)."""
+    weight = matched / matched.sum()
+    center_u, center_x = weight @ u, weight @ match
+    apart = u - center_u
+    cross = (weight[:, None] * (match - center_x)).T @ apart
+    left, stretch, right = np.linalg.svd(cross)
+    # The last axis is turned where a mirror image would fit better.
+    sign = np.ones(len(stretch))
+    sign[-1] = np.sign(np.linalg.det(left @ right))
+    rotation = (left * sign) @ right
+    own = float(weight @ (apart**2).sum(axis=1)) + u.shape[1] * mean_spread
+    scale = float(stretch @ sign) / own
+    return Similarity(scale, rotation, center_x - scale * rotation @ center_u)

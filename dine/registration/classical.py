@@ -1,0 +1,225 @@
+"""Classical registration, to compare with: nothing learned, one pair at a time.
+
+Every method is a class in :data:`CLASSICAL`; its arguments are those of the method, its call turns
+(N, 3) source and (M, 3) target points of the normalised frame into a displacement field. The
+defaults are the best settings found on validation pairs; docs/classical.md has the whole sweep.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+import trimesh.registration
+from threadpoolctl import threadpool_limits
+
+from dine.errors import ConfigError, DataError
+from dine.registration.bcpd import bcpd
+from dine.registration.frame import transformed
+from dine.registration.refine import ROUNDS, refine
+from dine.registry import Registry
+
+# Defaults of "cpd" and "bcpd": of 53 and 21 settings, those with the lowest mean correspondence
+# error among the ones that allow for outliers, on 30 synthetic validation pairs (16 in the manner
+# of SynBench, 14 of DeformedTissue): 0.016 and 0.026; unregistered 0.165. Targets held the same
+# points as the sources, shuffled. With points of their own (60 pairs) it is 0.081 and 0.080;
+# unregistered 0.161. docs/classical.md has the sweep.
+
+
+class Classical(ABC):
+    """Base of the classical methods; all are deterministic and run on one thread."""
+
+    registered_name: ClassVar[str]
+
+    def __call__(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """The displacement (N, 3), float64, of each source point.
+
+        Args:
+            source: (N, 3) points of the normalised frame.
+            target: (M, 3) points of the same frame, in any order.
+
+        Raises:
+            DataError: clouds of another shape, without points, or with values that are not finite.
+            ConfigError: the method's library is not installed.
+        """
+        source, target = _points(source, "source"), _points(target, "target")
+        # Small systems, for which many threads only wait for each other.
+        with threadpool_limits(1, user_api="blas"):
+            return np.asarray(self.moved(source, target), dtype=np.float64) - source
+
+    @abstractmethod
+    def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Where the (N, 3) source points belong; both clouds are checked and float64."""
+
+
+CLASSICAL: Registry[Classical] = Registry("classical method")
+"""The methods by name."""
+
+
+@CLASSICAL.register("unregistered")
+class Unregistered(Classical):
+    """Moves nothing: how far apart the clouds are to begin with."""
+
+    def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return source
+
+
+@CLASSICAL.register("icp")
+class RigidICP(Classical):
+    """Rotation and translation by iterative closest points (trimesh), from where the clouds are.
+
+    Unlike :func:`dine.registration.frame.rigid_alignment`, whatever it ends at is taken.
+
+    Args:
+        iterations: at most.
+        tolerance: stop once the mean squared distance changes less than this.
+    """
+
+    def __init__(self, *, iterations: int = 200, tolerance: float = 1e-9):
+        self.iterations = int(_positive("iterations", iterations))
+        self.tolerance = _positive("tolerance", tolerance)
+
+    def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        matrix, _, _ = trimesh.registration.icp(
+            source,
+            target,
+            max_iterations=self.iterations,
+            threshold=self.tolerance,
+            scale=False,
+            reflection=False,
+        )
+        return transformed(source, matrix)
+
+
+@CLASSICAL.register("cpd")
+class CPD(Classical):
+    """Deformable coherent point drift (Myronenko and Song, IEEE TPAMI 2010), by rustcpd.
+
+    Args:
+        beta: width of the Gaussian kernel, in units of the frame.
+        lam: λ, the weight of smoothness; some libraries call it alpha.
+        outliers: w in [0, 1), the share of target points that belong to no source point.
+        rank: most columns of the pivoted Cholesky root of the kernel matrix.
+        iterations: at most.
+        tolerance: stop once the variance of the mixture changes less than this.
+    """
+
+    def __init__(
+        self,
+        *,
+        beta: float = 0.5,
+        lam: float = 64.0,
+        outliers: float = 0.1,
+        rank: int = 400,
+        iterations: int = 300,
+        tolerance: float = 1e-7,
+    ):
+        self.beta = _positive("beta", beta)
+        self.lam = _positive("lam", lam)
+        self.outliers = _share("outliers", outliers)
+        self.rank = int(_positive("rank", rank))
+        self.iterations = int(_positive("iterations", iterations))
+        self.tolerance = _positive("tolerance", tolerance)
+
+    def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        try:
+            import rustcpd
+        except ImportError as error:
+            raise ConfigError(
+                "The classical method 'cpd' needs rustcpd: pip install "
+                "dine-registration[classical]."
+            ) from error
+        return rustcpd.register_deformable(
+            target,
+            source,
+            alpha=self.lam,
+            beta=self.beta,
+            low_rank=self.rank,
+            # The Cholesky root stops by itself where the kernel is explained.
+            low_rank_method="pivoted_cholesky",
+            low_rank_tolerance=1e-6,
+            normalize=False,
+            outlier_weight=self.outliers,
+            max_iterations=self.iterations,
+            tolerance=self.tolerance,
+            parallel=False,
+        ).points
+
+
+@CLASSICAL.register("bcpd")
+class BCPD(Classical):
+    """Bayesian coherent point drift (Hirose, IEEE TPAMI 2021): :func:`dine.registration.bcpd.bcpd`.
+
+    Args:
+        beta: width of the Gaussian kernel, in standard deviations of the source.
+        lam: λ; displacements have an expected length of √(3 / λ) of these.
+        outliers: ω in [0, 1), the share of target points that belong to no source point.
+        gamma: factor on the standard deviation that the mixture starts with.
+        uncertain: let the posterior variance of the displacements count.
+        rank: most columns of the root of the kernel matrix.
+        iterations: at most.
+        tolerance: stop once the standard deviation of the mixture changes less than this.
+    """
+
+    def __init__(
+        self,
+        *,
+        beta: float = 1.4,
+        lam: float = 20.0,
+        outliers: float = 0.1,
+        gamma: float = 1.0,
+        uncertain: bool = False,
+        rank: int = 300,
+        iterations: int = 500,
+        tolerance: float = 1e-4,
+    ):
+        self.beta = _positive("beta", beta)
+        self.lam = _positive("lam", lam)
+        self.outliers = _share("outliers", outliers)
+        self.gamma = _positive("gamma", gamma)
+        self.uncertain = bool(uncertain)
+        self.rank = int(_positive("rank", rank))
+        self.iterations = int(_positive("iterations", iterations))
+        self.tolerance = _positive("tolerance", tolerance)
+
+    def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return bcpd(source, target, **vars(self)).moved
+
+
+@CLASSICAL.register("smooth")
+class SmoothFields(Classical):
+    """The most probable smooth field: :func:`dine.registration.refine.refine` without a network.
+
+    What refinement at test time achieves on its own; our method, not one from the literature.
+
+    Args:
+        rounds: of expectation and maximisation.
+    """
+
+    def __init__(self, *, rounds: int = ROUNDS):
+        self.rounds = int(_positive("rounds", rounds))
+
+    def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+        return source + refine(source, target, None, None, rounds=self.rounds)
+
+
+def _points(points: np.ndarray, what: str) -> np.ndarray:
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise DataError(f"Expected a {what} of shape (N, 3), found {points.shape}.")
+    if not np.isfinite(points).all():
+        raise DataError(f"The {what} has coordinates that are not finite.")
+    return np.ascontiguousarray(points)
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0 < value < np.inf:
+        raise ConfigError(f"{name} of a classical method is {value}; expected a positive number.")
+    return float(value)
+
+
+def _share(name: str, value: float) -> float:
+    if not 0 <= value < 1:
+        raise ConfigError(f"{name} of a classical method is {value}; expected 0 <= {name} < 1.")
+    return float(value)

@@ -1,0 +1,383 @@
+"""Every metric against a closed form or a naive computation."""
+
+import time
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+
+from dine.data.pairs import (
+    PairSet,
+    Variant,
+    make_variant,
+    read_pairs,
+    read_variant_subset,
+    write_pairs,
+    write_variant,
+)
+from dine.errors import DataError
+from dine.evaluation.metrics import evaluate
+from dine.evaluation.predictions import FORMAT, Prediction, put_prediction, read_predictions
+from dine.evaluation.quality import (
+    agreement,
+    chamfer,
+    correspondence,
+    distances,
+    fit,
+    folding,
+    neighbourhoods,
+    roughness,
+)
+from dine.reporting.tables import COLUMNS, all_tables, load_metrics, to_latex, to_markdown
+
+POINTS = 200
+
+
+def ball(rng, count):
+    points = rng.normal(size=(count, 3))
+    points *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(points, axis=1, keepdims=True)
+    points -= points.mean(axis=0)
+    return points / np.linalg.norm(points, axis=1).max()
+
+
+# ------------------------------------------------------------------------------------ measures
+
+
+def test_distances_to_hand_made_clouds():
+    a = np.array([[0.0, 0, 0], [1, 0, 0]])
+    b = np.array([[0.0, 3, 4], [0, 0, 0], [1, 0, 2]])
+    assert distances(a, b).tolist() == [0, 1]
+    assert distances(b, a).tolist() == [5, 0, 2]
+    found = fit(a, b)
+    assert found["hausdorff"] == 5
+    assert found["chamfer"] == chamfer(a, b) == pytest.approx(1 / 2 + 29 / 3)
+    assert found["chamfer_unsquared"] == pytest.approx(1 / 2 + 7 / 3)
+    # Of 0, 2 and 5 with linear interpolation; the other direction's is smaller.
+    assert found["hd95"] == pytest.approx(2 + 0.9 * 3)
+    assert fit(a, b, partial=True)["chamfer"] == pytest.approx(29 / 3)
+
+
+def test_hd95_forgives_what_hausdorff_does_not():
+    line = np.zeros((100, 3))
+    line[:, 0] = np.arange(100)
+    away = line.copy()
+    away[-1, 1] = 50
+    found = fit(line, away)
+    assert found["hausdorff"] == 50
+    assert found["hd95"] == 0
+    assert agreement(np.zeros(3), np.full(3, 2.0))["hd95"] == 2
+
+
+def test_correspondence_errors_are_counted_by_thresholds():
+    target = np.zeros((4, 3))
+    moved = np.array([[0.05, 0, 0], [0, 0.06, 0], [0, 0, 0.1], [0.3, 0, 0.4]])
+    found = correspondence(moved, target)
+    assert found["mce"] == pytest.approx((0.05 + 0.06 + 0.1 + 0.5) / 4)
+    assert found["mce_median"] == pytest.approx(0.08)
+    assert found["mce_p95"] == pytest.approx(np.percentile([0.05, 0.06, 0.1, 0.5], 95))
+    assert found["accuracy_2_5"] == 0.25
+    assert found["accuracy_5"] == 0.75
+    assert found["far_points"] == 0.25
+
+
+def test_a_translation_neither_folds_nor_strains():
+    points = ball(np.random.default_rng(0), POINTS)
+    shift = np.array([0.1, 0.2, -0.2])
+    found = correspondence(points + shift, points)
+    for name in ("mce", "mce_median", "mce_p95"):
+        assert found[name] == pytest.approx(0.3)
+    field = np.broadcast_to(shift, points.shape)
+    assert folding(points, field) == 0
+    assert roughness(points, field) == pytest.approx(0, abs=1e-12)
+
+
+def test_a_reflection_folds_everywhere():
+    points = ball(np.random.default_rng(0), POINTS)
+    assert folding(points, points * [-1, 1, 1] - points) == 1
+    assert folding(points, -2 * points) == 1
+
+
+def test_roughness_is_the_strain():
+    points = ball(np.random.default_rng(0), POINTS)
+    # ‖d_i − d_j‖ = s ‖x_i − x_j‖ for a stretch, 2 sin(φ/2) ‖x_i − x_j‖ in the plane of a turn.
+    assert roughness(points, 0.3 * points) == pytest.approx(0.3)
+    flat = points * [1, 1, 0]
+    c, s = np.cos(0.2), np.sin(0.2)
+    turned = flat @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    assert roughness(flat, turned - flat) == pytest.approx(2 * np.sin(0.1))
+
+
+def test_roughness_and_neighbours_against_loops():
+    rng = np.random.default_rng(0)
+    points, field = ball(rng, 40), rng.normal(size=(40, 3))
+    neighbours = neighbourhoods(points)
+    ratios = []
+    for i in range(40):
+        away = np.linalg.norm(points - points[i], axis=1)
+        nearest = np.argsort(away)[1:13]
+        assert set(neighbours[i]) == set(nearest)
+        ratios += [((field[i] - field[j]) ** 2).sum() / away[j] ** 2 for j in nearest]
+    assert roughness(points, field) == pytest.approx(np.sqrt(np.mean(ratios)))
+    assert roughness(points, field, neighbours) == roughness(points, field)
+    assert folding(points, field, neighbours) == folding(points, field)
+
+
+def test_few_or_coinciding_points_have_no_strain():
+    assert roughness(np.zeros((1, 3)), np.ones((1, 3))) == 0
+    assert folding(np.zeros((1, 3)), np.ones((1, 3))) == 0
+    assert roughness(np.zeros((5, 3)), np.eye(5)[:, :3]) == 0
+    twice = np.repeat(ball(np.random.default_rng(0), 20), 2, axis=0)
+    assert roughness(twice, 0.5 * twice) == pytest.approx(0.5)
+
+
+# ----------------------------------------------------------------------------------- evaluation
+
+
+def make_pairs(points=POINTS, count=3):
+    rng = np.random.default_rng(0)
+    source = np.stack([ball(rng, points) for _ in range(count)])
+    names = np.array([f"0.5/{i}_1_0.5" for i in range(count)])
+    return PairSet(
+        source=source,
+        target=source + 0.1 * np.sin(3 * source[..., ::-1]),
+        center=np.zeros((count, 3)),
+        scale=np.arange(1.0, count + 1) * 10,
+        level=np.full(count, 0.5),
+        name=names,
+        object=np.array([str(i) for i in range(count)]),
+        split=np.array(["test"] * count),
+        source_file=names,
+        target_file=names,
+        vertex_index=np.zeros((count, points, 3)),
+        vertex_weight=np.zeros((count, points, 3)),
+        attributes={"origin": "synthetic"},
+    )
+
+
+@pytest.fixture
+def stored(tmp_path):
+    path = tmp_path / "pairs.h5"
+    write_pairs(path, make_pairs())
+    return read_pairs(path)
+
+
+def write_predictions(path, predictions):
+    with h5py.File(path, "w") as file:
+        file.attrs["format"] = FORMAT
+        for number, prediction in enumerate(predictions):
+            put_prediction(file.create_group(str(number)), prediction)
+
+
+def run(tmp_path, predictions, variants=(), **arguments):
+    write_predictions(tmp_path / "p.h5", predictions)
+    arguments = {"dataset": "d", "backbone": "b", "method": "m"} | arguments
+    evaluate(
+        *({arguments.pop("method"): tmp_path / "p.h5"}, tmp_path / "pairs.h5", list(variants)),
+        *(tmp_path / "m.csv", tmp_path / "e.h5"),
+        **arguments,
+    )
+    return pd.read_csv(tmp_path / "m.csv")
+
+
+def test_predictions_go_there_and_back(tmp_path, stored):
+    rng = np.random.default_rng(0)
+    field = rng.random((3, POINTS, 3), np.float32)
+    spread = rng.random((3, POINTS), np.float32)
+    seconds = np.array([0.1, 0.2, 0.3])
+    whole = Prediction("deformation", 0.0, stored.name, field, spread, seconds)
+    some = Prediction("noise", 0.01, stored.name[:1], field[:1])
+    write_predictions(tmp_path / "p.h5", [some, whole])
+    found = read_predictions(tmp_path / "p.h5")
+    assert [p.condition for p in found] == ["deformation", "noise"]
+    np.testing.assert_array_equal(found[0].displacement, field)
+    np.testing.assert_array_equal(found[0].spread, spread)
+    np.testing.assert_array_equal(found[0].seconds, seconds)
+    assert found[0].spread.dtype == np.float32
+    assert found[1].pair.tolist() == [stored.name[0]]
+    assert found[1].spread is found[1].seconds is None
+    with h5py.File(tmp_path / "p.h5") as file:
+        for name in ("displacement", "spread", "seconds"):
+            assert file["1"][name].fletcher32
+            assert file["1"][name].attrs["description"]
+
+
+def test_a_perfect_field_has_no_error(tmp_path, stored):
+    found = run(tmp_path, [Prediction("deformation", 0.0, stored.name, stored.displacement)])
+    zero = ["cd", "cd_observed", "mce", "cd_unsquared", "hd95", "hausdorff", "mce_median"]
+    zero += ["mce_p95", "far_points", "folding", "mce_original"]
+    assert found[zero].max(axis=None) == pytest.approx(0, abs=1e-5)
+    assert (found[["accuracy_2_5", "accuracy_5"]] == 1).all(axis=None)
+    assert found["roughness"].tolist() == pytest.approx(found["roughness_true"].tolist(), rel=1e-5)
+    assert (found["roughness_true"] > 0.1).all()
+
+
+def test_columns_keep_their_names_and_order(tmp_path, stored):
+    prediction = Prediction("deformation", 0.0, stored.name, stored.displacement)
+    found = run(tmp_path, [prediction], seed=3)
+    assert found["seed"].tolist() == [3] * 3
+    columns = found.columns.tolist()
+    assert columns.pop(columns.index("method") + 1) == "seed"
+    assert columns[: len(COLUMNS)] == COLUMNS
+    assert columns[len(COLUMNS) :] == [
+        *("cd_unsquared", "hd95", "hausdorff", "mce_median", "mce_p95", "accuracy_2_5"),
+        *("accuracy_5", "far_points", "folding", "roughness", "roughness_true", "mce_original"),
+        "seconds",
+    ]
+
+
+def test_every_column_of_a_row_against_naive_computations(tmp_path, stored):
+    rng = np.random.default_rng(1)
+    field = (stored.displacement + 0.05 * rng.normal(size=(3, POINTS, 3))).astype(np.float32)
+    seconds = np.array([1.0, 2.0, 4.0])
+    found = run(
+        tmp_path, [Prediction("deformation", 0.0, stored.name, field, None, seconds)], seed=7
+    )
+    for i, row in enumerate(found.itertuples()):
+        source, target = stored.source[i].astype(float), stored.target[i].astype(float)
+        moved = source + field[i]
+        table = np.linalg.norm(moved[:, None] - target[None], axis=2)
+        there, back = table.min(axis=1), table.min(axis=0)
+        errors = np.linalg.norm(moved - target, axis=1)
+        expected = {
+            "cd": (there**2).mean() + (back**2).mean(),
+            "cd_unsquared": there.mean() + back.mean(),
+            "hd95": max(np.percentile(there, 95), np.percentile(back, 95)),
+            "hausdorff": max(there.max(), back.max()),
+            "mce": errors.mean(),
+            "mce_median": np.median(errors),
+            "mce_p95": np.percentile(errors, 95),
+            "accuracy_2_5": (errors <= 0.05).mean(),
+            "accuracy_5": (errors <= 0.1).mean(),
+            "far_points": (errors > 0.1).mean(),
+            "folding": folding(source, field[i].astype(float)),
+            "roughness": roughness(source, field[i].astype(float)),
+            "roughness_true": roughness(source, target - source),
+            "mce_original": errors.mean() * stored.scale[i],
+            "seconds": seconds[i],
+        }
+        for name, value in expected.items():
+            assert getattr(row, name) == pytest.approx(value, rel=1e-6), name
+        # In the units of the files it is the error there, too.
+        original = stored.to_original(moved, i) - stored.to_original(target, i)
+        assert row.mce_original == pytest.approx(np.linalg.norm(original, axis=1).mean())
+        assert row.accuracy_5 + row.far_points == pytest.approx(1)
+        assert row.roughness > row.roughness_true
+        assert row.cd_observed == row.cd
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert file["deformation/squared_distance"][2].mean() == pytest.approx((there**2).mean())
+
+
+def test_predictions_and_variants_may_be_of_some_pairs(tmp_path, stored):
+    names = stored.name[[2, 0]]
+    noise = make_variant(stored.select(index=[0, 2]), "noise", 0.02, seed=0)
+    rng = np.random.default_rng(2)
+    other = np.stack([ball(rng, 50) for _ in range(2)])
+    resampled = Variant("resampled", 1.0, other, np.ones((2, 50), bool), stored.name[[2, 1]])
+    for name, variant in (("noise", noise), ("resampled", resampled)):
+        write_variant(tmp_path / f"{name}.h5", variant, stored.checksum)
+    files = [tmp_path / "noise.h5", tmp_path / "resampled.h5"]
+    fields = np.zeros((3, POINTS, 3), np.float32)
+    found = run(
+        tmp_path,
+        [
+            Prediction("deformation", 0.0, stored.name, fields),
+            Prediction("noise", 0.02, names, fields[:2]),
+            Prediction("resampled", 1.0, stored.name[1:2], fields[:1]),
+        ],
+        files,
+    )
+    assert found["condition"].tolist() == ["deformation"] * 3 + ["noise"] * 2 + ["resampled"]
+    assert found["pair"].tolist() == [*stored.name, *names, stored.name[1]]
+    assert found["seconds"].isna().all()
+    for row in found.itertuples():
+        index = stored.name.tolist().index(row.pair)
+        seen = {
+            "deformation": stored.target[index],
+            "noise": noise.target[index // 2],
+            "resampled": other[1],
+        }[row.condition]
+        assert row.cd_observed == pytest.approx(chamfer(stored.source[index], seen), rel=1e-5)
+        assert row.cd == pytest.approx(row.cd_unregistered)
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert set(file) == {"deformation", "noise_0.02", "resampled_1"}
+        assert file["noise_0.02/pair"].asstr()[:].tolist() == names.tolist()
+
+
+def test_predictions_that_do_not_fit_are_refused(tmp_path, stored):
+    fields = np.zeros((3, POINTS, 3), np.float32)
+    some = make_variant(stored.select(index=[0, 2]), "noise", 0.02, seed=0)
+    write_variant(tmp_path / "v.h5", some, stored.checksum)
+    noisy = Prediction("noise", 0.02, stored.name, fields)
+    with pytest.raises(DataError, match="no variant file was given"):
+        run(tmp_path, [noisy])
+    with pytest.raises(DataError, match=r"unknown to the variant file of noise_0\.02"):
+        run(tmp_path, [noisy], [tmp_path / "v.h5"])
+    with pytest.raises(DataError, match=r"the pair 'x', unknown to .*pairs\.h5"):
+        run(tmp_path, [Prediction("deformation", 0.0, np.array(["x"]), fields[:1])])
+    with pytest.raises(DataError, match=r"fields of 150 points, but .* has 200"):
+        run(tmp_path, [Prediction("deformation", 0.0, stored.name, fields[:, :150])])
+
+
+def test_subsets_of_variants(tmp_path, stored):
+    path = tmp_path / "v.h5"
+    noise = make_variant(stored.select(index=[2, 0]), "noise", 0.02, seed=0)
+    write_variant(path, noise, stored.checksum)
+    some, variant = read_variant_subset(path, stored)
+    assert some.name.tolist() == variant.name.tolist() == stored.name[[0, 2]].tolist()
+    np.testing.assert_array_equal(variant.target, noise.target[::-1])
+    np.testing.assert_array_equal(some.source, stored.source[[0, 2]])
+    some, variant = read_variant_subset(path, stored.select(index=[2]))
+    assert some.name.tolist() == variant.name.tolist() == stored.name[[2]].tolist()
+    with pytest.raises(DataError, match="none of them"):
+        read_variant_subset(path, stored.select(index=[1]))
+    write_variant(path, noise, "of others")
+    with pytest.raises(DataError, match=r"v\.h5 was made from other pairs"):
+        read_variant_subset(path, stored)
+
+
+def test_evaluation_is_fast(tmp_path):
+    pairs = make_pairs(1024, 8)
+    write_pairs(tmp_path / "pairs.h5", pairs)
+    field = pairs.displacement + np.float32(0.01)
+    prediction = Prediction("deformation", 0.0, pairs.name, field)
+    start = time.perf_counter()
+    run(tmp_path, [prediction])
+    # A pair takes about 15 ms on one core; the rest is for machines that do other things, too.
+    assert (time.perf_counter() - start) / len(pairs) < 0.2
+
+
+# -------------------------------------------------------------------------------------- tables
+
+
+def test_resampled_rows_break_no_table(tmp_path, stored):
+    other = np.stack([ball(np.random.default_rng(2), 50)] * 3)
+    resampled = Variant("resampled", 1.0, other, np.ones((3, 50), bool), stored.name)
+    write_variant(tmp_path / "v.h5", resampled, stored.checksum)
+    fields = np.zeros((3, POINTS, 3), np.float32)
+    files = []
+    for method in ("stage1", "lambda0", "pca"):
+        run(
+            tmp_path,
+            [
+                Prediction("deformation", 0.0, stored.name, fields),
+                Prediction("resampled", 1.0, stored.name, fields),
+            ],
+            [tmp_path / "v.h5"],
+            **{"dataset": "synbench", "backbone": "robust_defreg", "method": method},
+        )
+        files.append((tmp_path / "m.csv").rename(tmp_path / f"{method}.csv"))
+    metrics = load_metrics(files)
+    made = {table.name: table for table in all_tables(metrics)}
+    assert set(made) == {"table2", "gains_synbench", "correspondence_synbench"}
+    paper = made["table2"].data
+    assert set(paper["condition"]) == {"deformation"}
+    for name in ("gains_synbench", "correspondence_synbench"):
+        labels = [[cell.text for cell in row] for row in made[name].rows]
+        assert any("Resampled target" in row for row in labels)
+    alone = metrics[metrics["condition"] == "resampled"]
+    names = [table.name for table in all_tables(alone)]
+    assert names == ["gains_synbench", "correspondence_synbench"]
+    for table in made.values():
+        assert to_markdown(table)
+        assert to_latex(table)
