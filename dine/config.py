@@ -368,6 +368,8 @@ class Evidence(Section):
         default=[0, 1, 2], min_length=1
     )
     """Seeds of initial weights and training order; the data stay the same."""
+    first_seed_only: list[str] = []
+    """Priors of the backbones that are trained with the first seed alone."""
     test_objects: Count = 12
     """Further synthetic objects of each dataset to evaluate on; other data use the test split."""
     at_levels: list[Positive] = [0.5]

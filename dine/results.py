@@ -98,6 +98,8 @@ def evidence_cells(config: Config) -> list[Cell]:
         for backbone, settings in config.every_backbone.items():
             for number, seed in enumerate(evidence.seeds[: getattr(settings, "seeds", None)]):
                 names = config.methods(backbone)
+                if number:
+                    names = [name for name in names if name not in evidence.first_seed_only]
                 for name, method in evidence.methods.items():
                     if isinstance(method, ClassicalMethod):
                         continue

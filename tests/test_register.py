@@ -20,7 +20,6 @@ from dine.models.checkpoint import save_backbone
 from dine.priors.pca import PCAPrior
 from dine.registration.calibration import Calibration, load_calibration, plausibility
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
-from dine.registration.refine import covariance, refine
 from dine.registration.register import load_model
 from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 
@@ -252,37 +251,6 @@ def test_a_partial_target_pulls_only_what_it_shows(pair):
     assert 0.3 < found.report["supported"] < 0.95
     assert "no counterpart" in " ".join(found.trust.reasons)
     assert error(found.moved, target) < 0.9 * error(pulled.moved, target)
-
-
-def test_refinement_brings_noisy_fields_closer():
-    rng = np.random.default_rng(4)
-    source = organ().vertices[rng.permutation(642)[:400]]
-    truth = bump(source) - source
-    target = bump(organ().vertices)[rng.permutation(642)[:400]]
-    noisy = truth + 0.08 * rng.normal(size=truth.shape)
-    noise = np.full(len(truth), 0.08)
-
-    def error(field):
-        return np.linalg.norm(field - truth, axis=1).mean()
-
-    smoothed = refine(source, target, noisy, noise, rounds=0)
-    refined = refine(source, target, noisy, noise)
-    assert error(smoothed) < 0.6 * error(noisy)
-    assert error(refined) < 0.6 * error(noisy)
-    # Where the network is sure, it keeps its say.
-    shifted = truth + np.array([0.5, 0, 0])
-    sure = refine(source, target, shifted, np.full(len(truth), 1e-3), rounds=0)
-    assert np.abs(sure - shifted).max() < 0.1
-
-
-def test_refinement_is_the_mean_of_its_gaussian_process():
-    rng = np.random.default_rng(10)
-    points, value = rng.normal(size=(2, 30, 3))
-    error = rng.uniform(0.1, 0.3, size=30)
-    prior = covariance(points)
-    expected = prior @ np.linalg.solve(prior + np.diag((2 * error) ** 2), value)
-    found = refine(points, points, value, error, rounds=0)
-    assert np.abs(found - expected).max() < 1e-9
 
 
 def test_rounds_of_refinement_can_be_chosen(pair, result):

@@ -8,9 +8,9 @@ momentum, with restarts), which saves three of four.
 
 First, the field is stiff: few motions are probable, so that few wrong ones are. Two starts guard
 against a network that is mistaken as a whole: its field, and no displacement; the most probable
-result is kept. Then the prior is loosened to finish. Where source and target hold the same points,
+result goes on. Then the prior is loosened to finish. Where source and target hold the same points,
 the loose field ends on them, and is the better one. Where each scan has points of its own, it ends
-between them and has only followed their noise, so the stiff field is kept.
+between them and has only followed their noise, so the stiff field, at half time, is kept.
 
 A prior has few dimensions (:class:`~dine.priors.gaussian.LinearGaussian`), so a round costs N·M
 operations for the expectation and N·r² for the solve.
@@ -61,7 +61,7 @@ class Smoothness(NamedTuple):
         return LinearGaussian.of_kernel(root)
 
 
-STIFF = Smoothness((1.5, 0.4), (0.5, 0.04), 0.5, 0.01, 128)
+STIFF = Smoothness((1.5, 0.4), (0.2, 0.04), 0.05, 0.01, 128)
 LOOSE = Smoothness((1.5, 0.4, 0.25), (0.5, 0.2, 0.04), 0.5, 0.004, 200)
 
 
@@ -69,6 +69,9 @@ class _Result(NamedTuple):
     field: np.ndarray
     variance: float
     improbability: float
+
+    def rank(self) -> float:
+        return self.improbability
 
 
 def expected_error(spread: np.ndarray | None, points: int) -> np.ndarray:
@@ -96,8 +99,8 @@ def refine(
         target: (M, 3) points.
         displacement: (N, 3) of the network, or None to start from no displacement alone.
         error: (N,) its expected errors, or standard deviations; None likewise.
-        rounds: of the stiff field, at most, and half as many to finish; with 0 the network's field
-            is smoothed only.
+        rounds: of the stiff field, at most, and half as many to finish; points of their own, as in
+            two scans, get only the first half. With 0 the network's field is smoothed only.
         part: the source is a part of what the target shows. Every source point then looks for
             targets; otherwise every target looks for source points, which would stretch the part.
         prior: to finish with, in place of the loose process; its result is then always taken.
@@ -112,16 +115,15 @@ def refine(
             if rounds == 0:
                 return smoothed
             starts.insert(0, smoothed)
-        stiff = min(
-            (model.rounds(start, rounds) for start in starts),
-            key=lambda result: result.improbability,
-        )
+        found = [model.rounds(start, rounds) for start in starts]
+        early = min((half for half, _ in found), key=_Result.rank)
         if part and prior is None:
-            return stiff.field
+            return early.field
+        late = min((end for _, end in found), key=_Result.rank)
         finish = _Model(source, target, prior or LOOSE.at(source), LOOSE.least, int(part))
-        loose = finish.rounds(stiff.field, rounds // 2, stiff.variance)
+        _, loose = finish.rounds(late.field, rounds // 2, late.variance)
     if prior is None and not _same_points(source + loose.field, target):
-        return stiff.field
+        return early.field
     return loose.field
 
 
@@ -207,11 +209,13 @@ class _Model:
         np.maximum(exponent, _LEAST_EXPONENT, out=exponent)
         return np.exp(exponent, out=exponent)
 
-    def rounds(self, field: np.ndarray, rounds: int, variance: float | None = None) -> _Result:
-        """The field from one start, and how badly it explains the targets.
+    def rounds(
+        self, field: np.ndarray, rounds: int, variance: float | None = None
+    ) -> tuple[_Result, _Result]:
+        """The fields after half of the rounds and after all, and how badly they explain targets.
 
-        The last value is −log p(targets | field) − log p(field) up to a constant; the variance of
-        the distances is estimated from the start where it is not given.
+        That is −log p(targets | field) − log p(field) up to a constant. The variance of the
+        distances is estimated from the start where it is not given.
         """
         axis, source, least = self.axis, self.source, self.least**2
         squared = self._squared(source + field)
@@ -219,10 +223,14 @@ class _Model:
             variance = max(float(np.minimum(squared.min(axis=axis), 0.1).mean()), least)
         outlier = _OUTLIERS / _BOX
         last, momentum, energy, settled = field, 0, 0.0, False
+        half = _Result(field, variance, np.inf)
         for number in range(rounds + 1):
             factor = (1 - _OUTLIERS) / squared.shape[axis] / (2 * np.pi * variance) ** 1.5
             weight = self._densities(squared, variance)
             likelihood = factor * weight.sum(axis=axis).astype(np.float64) + outlier
+            improbability = energy - float(np.log(likelihood).sum())
+            if number == rounds // 2:
+                half = _Result(last, variance, improbability)
             if settled or number == rounds:
                 break
             share = (factor / likelihood).astype(np.float32)
@@ -243,4 +251,5 @@ class _Model:
             squared = self._squared(source + field)
             distance = float(np.vdot(weight, squared))
             variance = max(distance / (3 * max(mass.sum(), 1e-9)), least)
-        return _Result(field, variance, energy - float(np.log(likelihood).sum()))
+        end = _Result(field, variance, improbability)
+        return (half if number >= rounds // 2 else end), end

@@ -55,6 +55,7 @@ _MAY_LACK = {"level", "seconds", "mce", "accuracy_2_5", "accuracy_5", "far_point
 _DECIMALS = 6  # levels and corruptions that passed through float32 must still meet
 _DASH = "–"
 _LOWER, _HIGHER, _PARTIAL = "▼", "▲", "†"
+_MARKS = {"lower": f" {_LOWER}", "higher": f" {_HIGHER}", "none": ""}
 
 _COLOURS = {
     "none": "#999999",
@@ -575,13 +576,13 @@ def _best(evidence: Evidence, methods: Sequence[str], who: str) -> Finding | Non
     ]
     parts = []
     for place in evidence.places:
-        best = [
-            f"{evidence.title(order.index[0])} ({name})"
-            for value, (_, name, _, _) in _VALUES.items()
-            if len(order := evidence.ranking(methods, value, [place]))
-        ]
+        best: dict[str, list[str]] = {}
+        for value, (_, name, _, _) in _VALUES.items():
+            for winner in evidence.ranking(methods, value, [place]).index[:1]:
+                best.setdefault(evidence.title(winner), []).append(name)
         if best:
-            parts.append(f"{evidence.where(*place)}: {', '.join(best)}.")
+            winners_here = join([f"{winner} ({join(by)})" for winner, by in best.items()])
+            parts.append(f"{evidence.where(*place)}: {winners_here}.")
     text = (
         f"{who}, over all levels from {LARGE:g} on and all datasets and backbones: "
         f"{', and '.join(words)}."
@@ -670,13 +671,14 @@ def _against_classical(evidence: Evidence, methods: Sequence[str]) -> list[Findi
     if classical.empty:
         return [Finding("Classical methods were evaluated on some of the pairs only.")]
     rivals = sorted(set(classical["method"]), key=list(evidence.methods).index)
-    who = "all of these" if len(methods) > 1 else evidence.title(methods[0])
-    if len(below) < len(methods):
-        who = evidence.titles(below) if below else "none of these"
-        who = who if below or len(methods) > 1 else f"{evidence.title(methods[0])} is not"
-    verb = "" if who.endswith(" is not") else " are" if len(below) > 1 else " is"
+    if len(methods) == 1:
+        who = f"{evidence.titles(methods)} is{'' if below else ' not'}"
+    elif len(below) in (0, len(methods)):
+        who = "all that reach the goal are" if below else "none that reaches the goal is"
+    else:
+        who = f"{evidence.titles(below)} {_are(len(below))}"
     text = (
-        f"Against the best classical method of each level ({evidence.titles(rivals)}): {who}{verb} "
+        f"Against the best classical method of each level ({evidence.titles(rivals)}): {who} "
         "lower by both measures at every level, on every dataset and with every backbone."
     )
     if left_out:
@@ -782,11 +784,12 @@ def _minus(text: str) -> str:
 
 
 def _number(value: float, decimals: int, scale: float = 1.0) -> str:
-    return _DASH if pd.isna(value) else _minus(f"{scale * value:.{decimals}f}")
+    # Adding 0 makes −0 a 0.
+    return _DASH if pd.isna(value) else _minus(f"{round(scale * value, decimals) + 0:.{decimals}f}")
 
 
 def _signed(value: float, decimals: int) -> str:
-    return _DASH if pd.isna(value) else _minus(f"{value:+.{decimals}f}")
+    return _DASH if pd.isna(value) else _minus(f"{round(value, decimals) + 0:+.{decimals}f}")
 
 
 def _percent(share: float) -> str:
@@ -801,14 +804,11 @@ def _p(value: float) -> str:
 
 def _verdicts(comparisons: pd.DataFrame, value: str, *keys: str) -> dict[tuple, str]:
     """The mark of each method and setting; those of all levels have no level."""
-    marks = {"lower": f" {_LOWER}", "higher": f" {_HIGHER}", "none": ""}
-    some = comparisons[comparisons["value"] == value]
-    return {
-        (row["method"], *("all" if pd.isna(row[k]) else row[k] for k in keys)): marks[
-            row["verdict"]
-        ]
-        for _, row in some.iterrows()
-    }
+    found = {}
+    for row in comparisons[comparisons["value"] == value].to_dict("records"):
+        setting = ("all" if pd.isna(row[key]) else row[key] for key in keys)
+        found[row["method"], *setting] = _MARKS[row["verdict"]]
+    return found
 
 
 class _Kinds:
@@ -932,60 +932,64 @@ def goal_table(evidence: Evidence) -> Table:
     )
 
 
-def answer_table(evidence: Evidence, place: tuple[str, str], *, by_level: bool = False) -> Table:
+def answer_table(
+    evidence: Evidence, place: tuple[str, str], value: str, *, by_level: bool = False
+) -> Table | None:
     """Every method against the reference at a place: all levels together, or each."""
+    long, name, scale, decimals = _VALUES[value]
     data = at(evidence.cells, place) if by_level else evidence.overall(place)
-    data = data[data["method"].isin(evidence.rivals)]
-    groups = {
-        "mce": "Mean correspondence error",
-        "cd": "Chamfer distance ×10⁻⁴",
-    }
+    data = data[data["method"].isin(evidence.rivals) & (data["value"] == value)]
+    if data.empty:
+        return None
+    failures = value == "mce"
     rows, kinds = [], _Kinds(evidence)
-    keyed = data.assign(level=data["level"].where(data["level"].notna(), -1.0))
     for method in evidence.rivals:
-        mine = keyed[keyed["method"] == method]
-        for level, some in mine.groupby("level"):
-            some = some.set_index("value")
+        for row in data[data["method"] == method].to_dict("records"):
             cells = kinds.cells(method)
-            cells += [Cell(f"{level:g}")] if by_level else []
-            cells.append(Cell(str(some["pairs"].max())))
-            for value, (_, _, scale, decimals) in _VALUES.items():
-                cells += _compared(some, value, scale, decimals)
-            any_ = some.iloc[0]
-            cells += [
-                Cell(_percent(any_["failures_method"])),
-                Cell(_percent(any_["failures_reference"])),
-                Cell(_p(any_["p_failures"])),
-            ]
+            cells += [Cell(f"{row['level']:g}")] if by_level else []
+            cells += [Cell(str(row["pairs"])), *_compared(row, scale, decimals)]
+            if failures:
+                cells += [
+                    Cell(_percent(row["failures_method"])),
+                    Cell(_percent(row["failures_reference"])),
+                    Cell(_p(row["p_failures"])),
+                ]
             rows.append(tuple(cells))
-    labels = ("Difference [95 % interval]", "%", "p", "Effect", "Wins (%)")
+    unit = " ×10⁻⁴" if scale != 1 else ""
+    group = f"{long[0].upper()}{long[1:]}{unit}"
+    labels = ("Mean", "Reference", "Difference [95 % interval]", "%", "p", "Effect", "Wins (%)")
     header = [*_NAMES, *([("", "Level")] if by_level else []), ("", "Pairs")]
-    header += [(group, label) for group in groups.values() for label in labels]
-    header += [("Failures (%)", label) for label in ("Method", "Reference", "p")]
+    header += [(group, label) for label in labels]
+    if failures:
+        header += [("Failures", label) for label in ("%", "Reference %", "p")]
     which = "each level" if by_level else "all levels together"
-    return Table(
-        name=f"{'levels' if by_level else 'answer'}_{_slug(*place)}",
-        title=f"Against {evidence.title(evidence.reference)}, {which}: {evidence.where(*place)}",
-        caption=f"{evidence.where(*place)}, clean targets, {which}. Difference: method minus "
-        "reference, so negative is better; interval: bootstrap over objects; %: of the reference's "
-        "mean; p: Wilcoxon"
+    caption = (
+        f"{evidence.where(*place)}, clean targets, {which}. {long[0].upper()}{long[1:]}{unit}. "
+        "Difference: method minus reference, so negative is better; interval: bootstrap over "
+        "objects; %: of the reference's mean; p: Wilcoxon"
         + (", after Holm over the levels" if by_level else "")
-        + "; effect: rank-biserial, −1 to 1; wins: pairs on which the method is lower. Failures: "
-        "pairs with an MCE above 0.1, p by McNemar's test.",
+        + "; effect: rank-biserial, −1 to 1; wins: pairs on which the method is lower."
+    )
+    if failures:
+        caption += " Failures: pairs with an MCE above 0.1, p by McNemar's test."
+    return Table(
+        name=f"{'levels' if by_level else 'answer'}_{value}_{_slug(*place)}",
+        title=f"{name} against {evidence.title(evidence.reference)}, {which}: "
+        f"{evidence.where(*place)}",
+        caption=caption,
         header=tuple(header),
         rows=tuple(rows),
         data=data,
     )
 
 
-def _compared(some: pd.DataFrame, value: str, scale: float, decimals: int) -> list[Cell]:
-    if value not in some.index:
-        return [Cell(_DASH)] * 5
-    row = some.loc[value]
+def _compared(row: Mapping[str, Any], scale: float, decimals: int) -> list[Cell]:
     low, high = (_number(row[name], decimals, scale) for name in ("ci_low", "ci_high"))
     interval = "" if pd.isna(row["ci_low"]) else f" [{low}, {high}]"
-    mark = {"lower": f" {_LOWER}", "higher": f" {_HIGHER}", "none": ""}[row["verdict"]]
+    mark = _MARKS[row["verdict"]]
     return [
+        Cell(_number(row["mean_method"], decimals, scale)),
+        Cell(_number(row["mean_reference"], decimals, scale)),
         Cell(_number(row["difference"], decimals, scale) + interval),
         Cell(_signed(row["relative"], 1) + mark, bool(mark)),
         Cell(_p(row["p_holm"])),
@@ -1400,7 +1404,9 @@ def search_figure(
         axes.set_ylabel(f"{long[0].upper()}{long[1:]}{' ×10⁻⁴' if scale != 1 else ''}")
     if rough:
         control = curve[curve["lambda"] == 0].drop_duplicates(["roughness", "mce"])
-        panels[-1].plot(control["roughness"], control["mce"], "s", color="#555555", label="λ = 0")
+        panels[-1].plot(
+            control["roughness"], control["mce"], "s", color="#555555", zorder=4, label="λ = 0"
+        )
         panels[-1].set_xlabel("Roughness of the field")
         panels[-1].set_ylabel("Mean correspondence error")
     for prior, (colour, marker) in _styles(curve["prior"]).items():
@@ -1538,10 +1544,17 @@ def _answer(evidence: Evidence) -> tuple[tuple[str, ...], tuple[Item | None, ...
         "change (see Seeds).",
     )
     folded = Folded(
-        "Every level", tuple(answer_table(evidence, p, by_level=True) for p in evidence.places)
+        "Every level",
+        tuple(
+            table
+            for place in evidence.places
+            for value in _VALUES
+            if (table := answer_table(evidence, place, value, by_level=True)) is not None
+        ),
     )
     goal = None if evidence.goal.empty else goal_table(evidence)
-    return text, (goal, *(answer_table(evidence, p) for p in evidence.places), folded)
+    pooled = [answer_table(evidence, p, value) for p in evidence.places for value in _VALUES]
+    return text, (goal, *pooled, folded)
 
 
 def _forest(evidence: Evidence, place: tuple[str, str]) -> Drawing | None:

@@ -1,0 +1,184 @@
+"""Refinement at test time: the linear solve, the rounds, and when the loose field is kept."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from dine.priors.gaussian import LinearGaussian, squared_exponential
+from dine.registration import refine as module
+from dine.registration.refine import LOOSE, STIFF, expected_error, refine
+
+
+def organ(count, seed):
+    """Points (count, 3) of an ellipsoid's surface, drawn evenly enough."""
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    rng = np.random.default_rng(seed)
+    points = mesh.vertices[rng.choice(len(mesh.vertices), count, replace=False)]
+    return points * [1.0, 0.7, 0.5]
+
+
+def bent(points):
+    """A smooth, large deformation (N, 3) of points."""
+    x, y, z = points.T
+    return np.column_stack([0.15 * y**2, 0.2 * np.sin(1.5 * x), 0.2 * x * y - 0.1 * z])
+
+
+def error(field, truth):
+    return np.linalg.norm(field - truth, axis=1).mean()
+
+
+@pytest.fixture(scope="module")
+def pair():
+    source = organ(400, 1)
+    truth = bent(source)
+    order = np.random.default_rng(2).permutation(len(source))
+    return source, (source + truth)[order], truth
+
+
+# --- the solve ------------------------------------------------------------------------------------
+
+
+def dense(prior, value, precision):
+    """The posterior mean by the formula, with the covariance of all 3N coordinates."""
+    points = len(prior.mean)
+    covariance = np.kron(prior.kernel @ prior.kernel.T, np.eye(3))
+    flat = prior.modes.reshape(len(prior.modes), 3 * points)
+    covariance += flat.T @ flat
+    noise = np.diag(np.repeat(1 / precision, 3))
+    deviation = (value - prior.mean).ravel()
+    mean = covariance @ np.linalg.solve(covariance + noise, deviation)
+    return prior.mean + mean.reshape(points, 3)
+
+
+@pytest.mark.parametrize(("modes", "rank"), [(0, 5), (4, 0), (4, 5)])
+def test_the_solve_is_the_posterior_mean(modes, rank):
+    rng = np.random.default_rng(modes + rank)
+    prior = LinearGaussian(
+        rng.normal(size=(12, 3)), rng.normal(size=(modes, 12, 3)), rng.normal(size=(12, rank))
+    )
+    value, precision = rng.normal(size=(12, 3)), rng.uniform(0.1, 5, size=12)
+    model = module._Model(rng.normal(size=(12, 3)), rng.normal(size=(7, 3)), prior, 0.01, 0)
+    field, energy = model.most_probable(value, precision)
+    np.testing.assert_allclose(field, dense(prior, value, precision), atol=1e-9)
+    # Half the squared Mahalanobis length of what the field is made of.
+    flat = np.concatenate(
+        [prior.modes.reshape(modes, 36), np.kron(prior.kernel.T, np.eye(3)).reshape(3 * rank, 36)]
+    )
+    deviation = (field - prior.mean).ravel()
+    least = np.linalg.lstsq(flat.T, deviation, rcond=None)[0]
+    assert energy == pytest.approx(0.5 * float(least @ least), rel=1e-6)
+
+
+def test_without_rounds_it_is_the_mean_of_the_stiff_process():
+    rng = np.random.default_rng(10)
+    points, value = rng.normal(size=(2, 30, 3))
+    deviation = rng.uniform(0.1, 0.3, size=30)
+    prior = squared_exponential(points, points, STIFF.widths, STIFF.amplitudes, STIFF.affine)
+    expected = prior @ np.linalg.solve(prior + np.diag((2 * deviation) ** 2), value)
+    found = refine(points, points, value, deviation, rounds=0)
+    # The root of the covariance leaves out a ten-thousandth of the variance.
+    assert np.abs(found - expected).max() < 5e-3
+
+
+# --- the rounds -----------------------------------------------------------------------------------
+
+
+def test_one_round_follows_the_formula(pair):
+    source, target, _ = pair
+    prior = STIFF.at(source)
+    model = module._Model(source, target, prior, STIFF.least, 0)
+    found = model.rounds(np.zeros_like(source), 1, variance=0.02)[1].field
+    squared = ((source[:, None] - target[None]) ** 2).sum(axis=2)
+    density = (1 - 0.1) / len(source) * np.exp(-squared / 0.04) / (2 * np.pi * 0.02) ** 1.5
+    share = density / (density.sum(axis=0) + 0.1 / 8)
+    mass = share.sum(axis=1)
+    value = share @ target / mass[:, None] - source
+    np.testing.assert_allclose(found, dense(prior, value, mass / 0.02), atol=2e-4)
+
+
+def test_every_field_becomes_more_probable(pair):
+    source, target, _ = pair
+    model = module._Model(source, target, STIFF.at(source), STIFF.least, 0)
+    found = [
+        model.rounds(np.zeros_like(source), rounds)[1].improbability for rounds in (1, 5, 20, 40)
+    ]
+    assert found == sorted(found, reverse=True)
+
+
+def test_the_network_is_improved_on(pair):
+    source, target, truth = pair
+    noisy = truth + 0.08 * np.random.default_rng(4).normal(size=truth.shape)
+    noise = np.full(len(truth), 0.08)
+    assert error(refine(source, target, noisy, noise, rounds=0), truth) < 0.6 * error(noisy, truth)
+    assert error(refine(source, target, noisy, noise), truth) < 0.01 * error(noisy, truth)
+
+
+def test_a_network_that_is_wrong_as_a_whole_does_no_harm(pair):
+    source, target, truth = pair
+    wrong = np.full_like(truth, 1.5)
+    sure = np.full(len(truth), 1e-3)
+    alone = refine(source, target, None, None)
+    assert error(refine(source, target, wrong, sure), truth) <= error(alone, truth) + 1e-6
+
+
+def test_shared_points_are_met(pair):
+    source, target, truth = pair
+    assert error(refine(source, target, None, None), truth) < 2e-3
+
+
+def test_points_of_their_own_are_not_followed(pair, monkeypatch):
+    source, _, truth = pair
+    other = organ(420, 9)
+    target = other + bent(other)
+    found = refine(source, target, None, None)
+    monkeypatch.setattr(module, "_SAME", np.inf)
+    loose = refine(source, target, None, None)
+    assert error(found, truth) < error(loose, truth)
+    # An ellipsoid hardly shows where along it a point went.
+    assert error(found, truth) < 0.8 * np.linalg.norm(truth, axis=1).mean()
+
+
+def test_outliers_are_ignored(pair):
+    source, target, truth = pair
+    strange = np.random.default_rng(3).uniform(-1, 1, size=(100, 3))
+    found = refine(source, np.concatenate([target, strange]), None, None)
+    assert error(found, truth) < 0.01
+
+
+def test_the_order_of_the_target_does_not_matter_and_nothing_is_random(pair):
+    source, target, truth = pair
+    noise = np.full(len(truth), 0.05)
+    found = refine(source, target, 0.8 * truth, noise)
+    np.testing.assert_array_equal(refine(source, target, 0.8 * truth, noise), found)
+    np.testing.assert_allclose(refine(source, target[::-1], 0.8 * truth, noise), found, atol=1e-4)
+
+
+def test_a_given_prior_finishes(pair):
+    source, target, truth = pair
+    only_shift = LinearGaussian(
+        np.zeros_like(source), np.eye(3)[:, None, :].repeat(len(source), axis=1), np.zeros((400, 0))
+    )
+    found = refine(source, target, truth, np.full(len(truth), 0.05), prior=only_shift)
+    assert np.ptp(found, axis=0).max() < 1e-6
+
+
+def test_a_part_looks_for_the_whole(pair):
+    source, target, truth = pair
+    shown = source[:, 0] > 0
+    found = refine(source[shown], target, None, None, part=True)
+    assert error(found, truth[shown]) < 0.5 * np.linalg.norm(truth[shown], axis=1).mean()
+
+
+def test_few_points():
+    source = organ(3, 5)
+    assert np.isfinite(refine(source, source[:1] + 0.1, None, None)).all()
+
+
+def test_expected_error():
+    assert expected_error(None, 4).tolist() == [0.05] * 4
+    assert expected_error(np.array([0.0, 0.2]), 2).tolist() == [0.03, 0.2]
+
+
+def test_the_loose_process_has_more_freedom_than_the_stiff_one():
+    points = organ(300, 6)
+    assert LOOSE.at(points).kernel.shape[1] > STIFF.at(points).kernel.shape[1]
