@@ -11,7 +11,7 @@ run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
 
 tiny: .venv/installed
-	$(BIN)/snakemake -j$(JOBS) all --configfile config/tiny.yaml
+	$(BIN)/snakemake -j$(JOBS) all evidence --configfile config/tiny.yaml
 
 test: .venv/installed
 	$(BIN)/pytest

@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("meshes", type=Path)
     parser.add_argument("--backbone", default="robust_defreg")
     parser.add_argument("--weights", type=Path)
-    parser.add_argument("--map", type=int, default=20, dest="rounds")
+    parser.add_argument("--map", type=int, default=40, dest="rounds")
     parser.add_argument("--prealign", default="auto")
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()

@@ -318,7 +318,7 @@ class Method(Section):
 
 class ClassicalMethod(Method):
     kind: Literal["classical"]
-    group: Literal["none", "classical"] = "classical"
+    group: Literal["none", "classical", "test time"] = "classical"
     algorithm: str
     """`unregistered`, `icp`, `cpd`, `bcpd`, `smooth`, or an import path `package.module:Class`."""
     arguments: dict[str, Any] = {}
@@ -357,6 +357,8 @@ AnyMethod = Annotated[ClassicalMethod | Stage2Method | RefinedMethod, Field(disc
 
 
 class EvidenceBackbone(BackboneConfig):
+    datasets: list[str] | None = None
+    """Datasets that it is trained on; by default all."""
     seeds: Count | None = None
     """How many of the seeds, from the first on; by default all."""
 
@@ -464,6 +466,8 @@ class Config(Compute):
         for name, backbone in self.evidence.backbones.items():
             for prior in backbone.priors:
                 self._known("priors", prior, f"evidence.backbones.{name}.priors")
+            for dataset in backbone.datasets or ():
+                self._known("datasets", dataset, f"evidence.backbones.{name}.datasets")
         for name, method in self.evidence.methods.items():
             where = f"evidence.methods.{name}"
             if name in taken or not _NAME.match(name):

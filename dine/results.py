@@ -96,6 +96,8 @@ def evidence_cells(config: Config) -> list[Cell]:
             if isinstance(method, ClassicalMethod) and dataset in (method.datasets or [dataset]):
                 cells.append(Cell(dataset, NO_BACKBONE, 0, name))
         for backbone, settings in config.every_backbone.items():
+            if dataset not in (getattr(settings, "datasets", None) or [dataset]):
+                continue
             for number, seed in enumerate(evidence.seeds[: getattr(settings, "seeds", None)]):
                 names = config.methods(backbone)
                 if number:

@@ -8,7 +8,14 @@ import yaml
 
 from dine import config
 from dine.errors import ConfigError
-from dine.results import figure_names, table_names
+from dine.results import (
+    NO_BACKBONE,
+    backbone_and_seed,
+    evidence_cells,
+    figure_names,
+    replica,
+    table_names,
+)
 
 ROOT = Path(__file__).parents[1]
 DEFAULT = yaml.safe_load((ROOT / "config.yaml").read_text())
@@ -45,7 +52,8 @@ def test_sizes_differ_in_numbers_only(name):
             else [value]
         )
 
-    assert all(isinstance(leaf, int | float) for leaf in leaves(change))
+    # Null leaves out a method or backbone.
+    assert all(leaf is None or isinstance(leaf, int | float) for leaf in leaves(change))
     config.load(ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml")
 
 
@@ -127,3 +135,65 @@ def test_a_prior_by_import_path_takes_any_arguments():
     values = changed("priors.mine", {"kind": "my_package:Prior", "arguments": {"anything": 1}})
     loaded = config.validate(values)
     assert config.check_arguments(loaded.priors["mine"]) == {"anything": 1}
+
+
+# --- evidence -------------------------------------------------------------------------------------
+
+
+def with_evidence(**changes):
+    values = config.merge(
+        config.read_yaml(ROOT / "config.yaml"), {"evidence": {"methods": {}, **changes}}
+    )
+    return config.validate(values)
+
+
+def test_every_seed_trains_what_the_config_says():
+    loaded = with_evidence(seeds=[0, 5, 7])
+    cells = evidence_cells(loaded)
+    assert len(set(cells)) == len(cells)
+    seeds = {
+        name: {c.seed for c in cells if c.method == name and c.backbone == "deftransnet"}
+        for name in ("stage1", "lambda0", "pca", "flow", "map")
+    }
+    every = {0, 5, 7}
+    assert seeds == dict.fromkeys(seeds, every) | {"flow": {0}}
+    assert {c.dataset for c in cells if c.backbone == "robust_defreg_default"} == {"synbench"}
+    # Without a backbone there is nothing to train, so there is one seed.
+    cpd = [c for c in cells if c.method == "cpd"]
+    assert [(c.dataset, c.backbone, c.seed) for c in cpd] == [
+        ("deformedtissue", NO_BACKBONE, 0),
+        ("synbench", NO_BACKBONE, 0),
+    ]
+    # A method for some backbones is not evaluated with others.
+    assert {c.backbone for c in cells if c.method == "pca_shuffled"} == {"robust_defreg"}
+
+
+def test_a_null_method_is_left_out():
+    loaded = with_evidence(methods={"cpd": None})
+    assert "cpd" not in loaded.evidence.methods
+    assert "bcpd" in loaded.evidence.methods
+
+
+def test_folders_of_seeds_go_there_and_back():
+    loaded = with_evidence()
+    assert replica(loaded, "deftransnet", loaded.seed) == "deftransnet"
+    for seed in (loaded.seed, 3):
+        folder = replica(loaded, "deftransnet", seed)
+        assert backbone_and_seed(loaded, folder) == ("deftransnet", seed)
+
+
+@pytest.mark.parametrize(
+    ("methods", "match"),
+    [
+        ({"pca": {"kind": "stage2"}}, "must have a name of its own"),
+        ({"new": {"kind": "stage2", "prior": "magic"}}, "names 'magic'"),
+        ({"new": {"kind": "stage2", "backbones": ["magic"]}}, "neither under `backbones`"),
+        ({"new": {"kind": "refined", "of": "magic"}}, "expected one of"),
+        ({"new": {"kind": "classical", "algorithm": "cpd", "datasets": ["x"]}}, "names 'x'"),
+        ({"new": {"kind": "magic"}}, "magic"),
+        ({"New": {"kind": "stage2"}}, "lower-case"),
+    ],
+)
+def test_faults_of_methods_are_named(methods, match):
+    with pytest.raises(ConfigError, match=match):
+        with_evidence(methods=methods)

@@ -6,11 +6,22 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 from test_html import Page
 
 from dine.errors import DataError
 from dine.evaluation import statistics
-from dine.reporting import evidence as ev
+from dine.reporting.evidence import (
+    Evidence,
+    Picture,
+    build_evidence,
+    figures,
+    load_evidence,
+    tables,
+)
+from dine.reporting.evidence.comparisons import at
+from dine.reporting.evidence.findings import all_findings
+from dine.reporting.figures import save_figure
 
 DATASETS = ("deformedtissue", "synbench")
 BACKBONES = ("robust_defreg", "deftransnet")
@@ -27,7 +38,7 @@ EFFECTS = {
     "smooth": 1.15,
     "map": 0.7,
 }
-BARE = ("unregistered", "cpd")
+BARE = ("unregistered", "cpd", "relaxed")
 METHODS = {
     "unregistered": {"title": "Unregistered", "group": "none"},
     "cpd": {"title": "CPD", "group": "classical", "description": "Coherent point drift."},
@@ -37,6 +48,7 @@ METHODS = {
     "gp": {"title": "Gaussian process", "group": "prior"},
     "smooth": {"title": "Smoothness", "group": "control"},
     "map": {"title": "MAP", "group": "test time"},
+    "relaxed": {"title": "Relaxed", "group": "test time"},
 }
 
 
@@ -89,12 +101,12 @@ def written(metrics, folder):
 
 
 def compared(*args, **options):
-    return ev.Evidence(made_up(*args, **options), METHODS)
+    return Evidence(made_up(*args, **options), METHODS)
 
 
 def said(evidence):
     """All findings as one text, and each by its beginning."""
-    return "\n".join(" | ".join((f.text, *f.parts)) for f in ev.findings(evidence))
+    return "\n".join(" | ".join((f.text, *f.parts)) for f in all_findings(evidence))
 
 
 def search(folder, **changes):
@@ -116,7 +128,7 @@ def test_strings_stay_strings_and_floats_meet(tmp_path):
     metrics = made_up({"lambda0": 1.0}, datasets=("d",), seeds=1, corrupted=False)
     metrics["pair"] = ["NA", *(f"{i:05d}" for i in range(1, len(metrics)))]
     metrics["level"] = metrics["level"].astype(np.float32).astype(float)
-    found = ev.load_evidence(written(metrics, tmp_path))
+    found = load_evidence(written(metrics, tmp_path))
     assert set(found["pair"]) == set(metrics["pair"])
     assert set(found["level"]) == set(LEVELS)
     assert found["seconds"].isna().all()
@@ -140,34 +152,34 @@ def test_unusable_files_are_refused(tmp_path, change, message):
     metrics = made_up({"lambda0": 1.0}, datasets=("d",), backbones=("b",), seeds=1)
     change(metrics).to_csv(tmp_path / "m.csv", index=False)
     with pytest.raises(DataError, match=message):
-        ev.load_evidence([tmp_path / "m.csv"])
+        load_evidence([tmp_path / "m.csv"])
 
 
 def test_files_that_contradict_each_other_are_refused(tmp_path):
     metrics = made_up({"lambda0": 1.0, "pca": 1.0}, datasets=("d",), backbones=("b",), seeds=1)
     paths = written(metrics, tmp_path)
     with pytest.raises(DataError, match=r"same evaluation twice .*dataset d, backbone b, method"):
-        ev.load_evidence([*paths, paths[0]])
+        load_evidence([*paths, paths[0]])
     changed = metrics["method"] == "pca"
     written(metrics.assign(origin=np.where(changed, "doi", "synthetic")), tmp_path)
     with pytest.raises(DataError, match=r"different origins \(doi, synthetic\)"):
-        ev.load_evidence(paths)
+        load_evidence(paths)
     with pytest.raises(DataError, match="does not exist"):
-        ev.load_evidence([tmp_path / "none.csv"])
+        load_evidence([tmp_path / "none.csv"])
     with pytest.raises(DataError, match="No metrics files"):
-        ev.load_evidence([])
+        load_evidence([])
 
 
 def test_reference_and_groups_are_checked(tmp_path):
     metrics = made_up({"pca": 1.0, "gp": 1.0}, datasets=("d",), backbones=("b",), seeds=1)
     with pytest.raises(DataError, match="reference 'lambda0'; they have pca, gp"):
-        ev.Evidence(metrics, {})
+        Evidence(metrics, {})
     with pytest.raises(DataError, match="pca has the unknown group 'magic'"):
-        ev.Evidence(metrics, {"pca": {"group": "magic"}}, "gp")
+        Evidence(metrics, {"pca": {"group": "magic"}}, "gp")
     with pytest.raises(DataError, match="no method to compare with 'gp'"):
-        ev.Evidence(metrics[metrics["method"] == "gp"], {}, "gp")
-    assert ev.Evidence(metrics, {}, "gp").methods["pca"].title == "pca"
-    assert ev.Evidence(metrics, {}, "gp").methods["pca"].kind == "Other"
+        Evidence(metrics[metrics["method"] == "gp"], {}, "gp")
+    assert Evidence(metrics, {}, "gp").methods["pca"].title == "pca"
+    assert Evidence(metrics, {}, "gp").methods["pca"].kind == "Other"
 
 
 # ----------------------------------------------------------------------------------- findings
@@ -179,7 +191,7 @@ def evidence(tmp_path_factory):
     # Targets were corrupted on one of the datasets only.
     metrics = metrics[(metrics["condition"] == "deformation") | (metrics["dataset"] == "synbench")]
     paths = written(metrics, tmp_path_factory.mktemp("metrics"))
-    return ev.Evidence(ev.load_evidence(paths), METHODS)
+    return Evidence(load_evidence(paths), METHODS)
 
 
 def test_findings_where_the_goal_is_reached(evidence):
@@ -220,13 +232,14 @@ def test_findings_where_the_goal_is_missed():
     effects = {"lambda0": 1.0, "pca": here_only, "gp": 1.0, "cpd": 0.9}
     words = said(compared(effects, seeds=1, corrupted=False))
     assert "PCA prior, is significantly better than λ = 0 at some levels and significantly" in words
-    # CPD reaches it, but is no network: the goal is judged for these beside it.
-    assert "Reached by CPD. Of the networks, closest is PCA prior: 6 of 12 cells hold" in words
+    # CPD reaches it, but is classical: the goal is judged for the others beside it.
+    assert "Reached by CPD. Of the methods that are not classical, closest is PCA prior:" in words
+    assert "closest is PCA prior: 6 of 12 cells hold" in words
     assert "best classical method of each level (CPD): PCA prior is not lower" in words
     del effects["cpd"]
     words = said(compared(effects, seeds=1, datasets=("synbench",), corrupted=False))
     assert "No method reaches it. Closest is PCA prior: 4 of 6 cells hold" in words
-    assert "No classical method (one without a network) was evaluated" in words
+    assert "No classical method was evaluated, so how PCA prior compares" in words
 
 
 def test_findings_where_the_prior_hurts():
@@ -260,20 +273,43 @@ def test_a_method_must_be_evaluated_everywhere_to_reach_the_goal():
         {"lambda0": 1.0, "pca": 0.8, "gp": 0.7}, datasets=("synbench",), corrupted=False
     )
     metrics = metrics[(metrics["method"] != "gp") | (metrics["backbone"] == "deftransnet")]
-    words = said(ev.Evidence(metrics, METHODS))
+    words = said(Evidence(metrics, METHODS))
     assert "Reached by PCA prior. Gaussian process reaches it wherever evaluated" in words
     # It cannot be ranked over all backbones, but it can where it was.
     assert "DefTransNet: Gaussian process (MCE and CD)." in words
     assert "PCA prior has the lowest mean correspondence error" in words
 
 
+def test_a_method_without_a_network_is_classical_only_by_its_group():
+    effects = {"unregistered": 4.0, "lambda0": 1.0, "pca": 0.9, "cpd": 0.95, "relaxed": 0.7}
+    evidence = compared(effects, seeds=2, datasets=("synbench",), corrupted=False)
+    assert evidence.classical == ["cpd"]
+    assert evidence.candidates == ["pca", "relaxed"]
+    words = said(evidence)
+    assert re.search("Of all methods, over all levels .*: Relaxed has the lowest mean", words)
+    assert "Reached by CPD, PCA prior and Relaxed." in words
+    assert "best classical method of each level (CPD): all that reach the goal are lower" in words
+    assert "Relaxed is lower in MCE at 8 of 8 levels and in CD at 8 of 8 levels." in words
+    for place in evidence.places:
+        assert shown(tables.answer_table(evidence, place, "mce"))["Relaxed"]["Pairs"].text == "48"
+        cells = shown(tables.level_table(evidence, place, "mce"))["Relaxed"]["Level 0.8"]
+        assert cells.bold
+        assert cells.text.endswith(" ▼")
+    assert figures.main_methods(evidence, "synbench") == ["cpd", "lambda0", "pca", "relaxed"]
+    del effects["cpd"]
+    evidence = compared(effects, seeds=1, datasets=("synbench",), corrupted=False)
+    assert evidence.classical == []
+    words = said(evidence)
+    assert "No classical method was evaluated, so how PCA prior and Relaxed compare" in words
+
+
 def test_large_levels_may_be_missing():
     metrics = made_up({"lambda0": 1.0, "pca": 0.8, "gp": 0.9}, datasets=("d",), corrupted=False)
-    evidence = ev.Evidence(metrics[metrics["level"] < 0.4], METHODS)
+    evidence = Evidence(metrics[metrics["level"] < 0.4], METHODS)
     words = said(evidence)
     assert "no pair has a level of at least 0.4" in words
     assert "Goal: no method can be judged at levels from 0.4 on" in words
-    assert ev.forest_figure(evidence, evidence.places[0]) is None
+    assert figures.forest_figure(evidence, evidence.places[0]) is None
 
 
 # ------------------------------------------------------------------------------------- tables
@@ -291,8 +327,8 @@ def shown(table):
 
 def test_level_table_holds_means_marks_and_the_lowest(evidence):
     place = ("synbench", "robust_defreg")
-    rows = shown(ev.level_table(evidence, place, "mce"))
-    clean = ev.at(evidence.clean, place)
+    rows = shown(tables.level_table(evidence, place, "mce"))
+    clean = at(evidence.clean, place)
     for name, mark in (("pca", " ▼"), ("smooth", " ▲"), ("lambda0", "")):
         mine = clean[clean["method"] == name]
         title = METHODS[name]["title"] + (" (reference)" if name == "lambda0" else "")
@@ -307,18 +343,18 @@ def test_level_table_holds_means_marks_and_the_lowest(evidence):
     failed = f"{100 * (over_seeds > 0.1).mean():.1f}"
     assert rows["Smoothness"]["All levels Failures (%)"].text == failed
     # Without a network: the same at every backbone.
-    other = shown(ev.level_table(evidence, ("synbench", "deftransnet"), "mce"))
+    other = shown(tables.level_table(evidence, ("synbench", "deftransnet"), "mce"))
     assert other["CPD"]["Level 0.8"].text == rows["CPD"]["Level 0.8"].text
-    cd = shown(ev.level_table(evidence, place, "cd"))
+    cd = shown(tables.level_table(evidence, place, "cd"))
     mean = clean.loc[(clean["method"] == "map") & (clean["level"] == 0.8), "cd"].mean()
     assert cd["MAP"]["Level 0.8"].text == f"{1e4 * mean:.2f} ▼"
 
 
 def test_answer_table_holds_the_statistics(evidence):
     place = ("deformedtissue", "deftransnet")
-    expected = statistics.compare(ev.at(evidence.clean, place), "pca", "lambda0")
+    expected = statistics.compare(at(evidence.clean, place), "pca", "lambda0")
     row = expected[expected["level"].isna() & (expected["value"] == "mce")].iloc[0]
-    cells = shown(ev.answer_table(evidence, place, "mce"))["PCA prior"]
+    cells = shown(tables.answer_table(evidence, place, "mce"))["PCA prior"]
     low, high = (f"{row[name]:.4f}".replace("-", "−") for name in ("ci_low", "ci_high"))
     group = "Mean correspondence error"
     difference = f"{row['difference']:.4f}".replace("-", "−")
@@ -329,7 +365,7 @@ def test_answer_table_holds_the_statistics(evidence):
     assert cells[f"{group} Wins (%)"].text == "100"
     assert cells["Failures Reference %"].text == f"{100 * row['failures_reference']:.1f}"
     assert cells["Pairs"].text == "48"
-    table = ev.answer_table(evidence, place, "cd", by_level=True)
+    table = tables.answer_table(evidence, place, "cd", by_level=True)
     assert len(table.rows) == 4 * len(evidence.rivals)
     assert set(table.data["verdict"]) <= {"lower", "higher", "none"}
     row = expected[(expected["level"] == 0.4) & (expected["value"] == "cd")].iloc[0]
@@ -339,7 +375,7 @@ def test_answer_table_holds_the_statistics(evidence):
 
 
 def test_goal_table_counts_levels(evidence):
-    rows = shown(ev.goal_table(evidence))
+    rows = shown(tables.goal_table(evidence))
     assert rows["MAP"]["Goal cells"].text == "12 of 12"
     assert rows["Smoothness"]["Goal cells"].text == "0 of 12"
     assert rows["Smoothness"]["SynBench, DefTransNet: of 3 levels any ▲"].text == "3"
@@ -347,7 +383,7 @@ def test_goal_table_counts_levels(evidence):
 
 def test_corruption_table_compares_with_the_same_clean_pairs(evidence):
     place = ("synbench", "robust_defreg")
-    table = ev.corruption_table(evidence, place, "mce")
+    table = tables.corruption_table(evidence, place, "mce")
     groups = list(dict.fromkeys(group for group, _ in table.header if group))
     assert groups == [
         "Noise σ = 0.03 (level 0.6)",
@@ -355,7 +391,7 @@ def test_corruption_table_compares_with_the_same_clean_pairs(evidence):
         "Resampled target (level 0.6)",
     ]
     cells = shown(table)["MAP"]
-    rows = ev.at(evidence.metrics, place).query("method == 'map' and level == 0.6")
+    rows = at(evidence.metrics, place).query("method == 'map' and level == 0.6")
     noisy, clean = (
         rows.loc[rows["condition"] == x, "mce"].mean() for x in ("noise", "deformation")
     )
@@ -364,11 +400,11 @@ def test_corruption_table_compares_with_the_same_clean_pairs(evidence):
 
 
 def test_seed_table_shows_the_spread_of_trainings(evidence):
-    table = ev.seed_table(evidence)
+    table = tables.seed_table(evidence)
     (cells,) = [
         r for r in table.rows if [c.text for c in r[:3]] == ["SynBench", "DefTransNet", "MAP"]
     ]
-    rows = ev.at(evidence.clean, ("synbench", "deftransnet")).query("method == 'map'")
+    rows = at(evidence.clean, ("synbench", "deftransnet")).query("method == 'map'")
     sd = rows.groupby("seed")["mce"].mean().std(ddof=1)
     assert [c.text for c in cells[3:6]] == ["3", f"{rows['mce'].mean():.4f}", f"{sd:.4f}"]
     assert not any(row[2].text == "CPD" for row in table.rows)
@@ -379,10 +415,10 @@ def test_a_method_seen_on_some_pairs_only_is_compared_on_these():
         {"lambda0": 1.0, "pca": 0.9, "cpd": 0.5}, datasets=("synbench",), corrupted=False
     )
     few = (metrics["method"] != "cpd") | metrics["object"].isin(["000", "001", "002"])
-    evidence = ev.Evidence(metrics[few], METHODS)
+    evidence = Evidence(metrics[few], METHODS)
     place = ("synbench", "robust_defreg")
-    assert shown(ev.answer_table(evidence, place, "mce"))["CPD"]["Pairs"].text == "12"
-    table = ev.level_table(evidence, place, "mce")
+    assert shown(tables.answer_table(evidence, place, "mce"))["CPD"]["Pairs"].text == "12"
+    table = tables.level_table(evidence, place, "mce")
     cells = shown(table)
     assert "†" in cells["CPD"]["Level 0.8"].text
     assert cells["PCA prior"]["Level 0.8"].bold
@@ -396,21 +432,27 @@ def test_a_method_seen_on_some_pairs_only_is_compared_on_these():
 
 
 def test_forest_figure_has_a_row_for_every_method(evidence):
-    figure = ev.forest_figure(evidence, ("synbench", "robust_defreg"))
+    figure = figures.forest_figure(evidence, ("synbench", "robust_defreg"))
     left = figure.axes[0]
     names = [label.get_text() for label in left.get_yticklabels()]
     assert [n for n in names if n in {m["title"] for m in METHODS.values()}] == [
         *("CPD", "Stage 1", "Smoothness", "PCA prior", "Gaussian process", "MAP"),
     ]
     texts = {round(t.get_position()[1]): t.get_text() for t in left.texts}
-    large = ev.at(evidence.large, ("synbench", "robust_defreg"))
+    large = at(evidence.large, ("synbench", "robust_defreg"))
     row = large[(large["method"] == "map") & (large["value"] == "mce")].iloc[0]
+    rows = at(evidence.large_rows, ("synbench", "robust_defreg"))
+    expected = statistics.compare(rows, "map", "lambda0")
+    expected = expected[expected["level"].isna() & (expected["value"] == "mce")].iloc[0]
+    for name in ("pairs", "relative", "ci_low", "ci_high", "p_holm", "seed_sd_method"):
+        assert row[name] == expected[name]
     assert texts[names.index("MAP")] == f"{row['relative']:.1f} %".replace("-", "−")
     assert "synthetic data" in figure.get_suptitle()
 
 
 def test_main_methods_are_few_and_the_best_of_their_group(evidence):
-    assert ev.main_methods(evidence, "synbench") == ["cpd", "stage1", "lambda0", "pca", "gp", "map"]
+    main = figures.main_methods(evidence, "synbench")
+    assert main == ["cpd", "stage1", "lambda0", "pca", "gp", "map"]
 
 
 # -------------------------------------------------------------------------------------- report
@@ -431,16 +473,16 @@ def report(tmp_path_factory):
             }
         )
     )
-    figure = ev.Figure(figsize=(2, 1))
+    figure = Figure(figsize=(2, 1))
     figure.subplots().plot([0, 1])
-    ev.draw.save_figure(figure, folder / "pca")
-    ev.build_evidence(
+    save_figure(figure, folder / "pca")
+    build_evidence(
         written(made_up(few, datasets=("synbench",), seeds=2), folder),
         folder / "out",
         methods=methods,
         searches=[search(folder)],
         diagnostics=[diagnostics],
-        examples=[ev.Picture("synbench", folder / "pca.png", "A liver.")],
+        examples=[Picture("synbench", folder / "pca.png", "A liver.")],
         config={"note": "<script>alert(1)</script>"},
     )
     return folder / "out"
@@ -497,7 +539,7 @@ def test_report_writes_tables_and_figures(report):
 def test_parts_without_data_are_left_out(tmp_path):
     metrics = made_up({"lambda0": 1.0, "pca": 0.9}, datasets=("liver",), seeds=1, corrupted=False)
     metrics = metrics[metrics["backbone"] == "deftransnet"].assign(origin="path")
-    ev.build_evidence(written(metrics, tmp_path), tmp_path / "out", methods={})
+    build_evidence(written(metrics, tmp_path), tmp_path / "out", methods={})
     page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     assert {"corrupted", "seeds", "priors", "examples"}.isdisjoint(page.ids)
     assert {"main", "answer", "methods"} <= page.ids
@@ -510,20 +552,20 @@ def test_files_of_unknown_datasets_are_refused(tmp_path):
     metrics = made_up({"lambda0": 1.0, "pca": 0.9}, datasets=("d",), seeds=1, corrupted=False)
     paths = written(metrics, tmp_path)
     with pytest.raises(DataError, match="is of synbench, of which there are no metrics"):
-        ev.build_evidence(paths, tmp_path, methods={}, searches=[search(tmp_path)])
+        build_evidence(paths, tmp_path, methods={}, searches=[search(tmp_path)])
     bad = tmp_path / "bad.json"
     bad.write_text("{}")
     with pytest.raises(DataError, match="lacks dataset"):
-        ev.build_evidence(paths, tmp_path, methods={}, diagnostics=[bad])
-    picture = ev.Picture("moon", tmp_path / "x.png", "")
+        build_evidence(paths, tmp_path, methods={}, diagnostics=[bad])
+    picture = Picture("moon", tmp_path / "x.png", "")
     with pytest.raises(DataError, match="is of moon"):
-        ev.build_evidence(paths, tmp_path, methods={}, examples=[picture])
+        build_evidence(paths, tmp_path, methods={}, examples=[picture])
     assert not (tmp_path / "report.html").exists()
 
 
 def test_search_figure_shows_choice_and_control(evidence, tmp_path):
     values = json.loads(search(tmp_path).read_text())
-    figure = ev.search_figure(evidence, ("synbench", "robust_defreg"), [values], "synthetic")
+    figure = figures.search_figure(evidence, ("synbench", "robust_defreg"), [values], "synthetic")
     mce, cd, trade = figure.axes
     assert [line.get_ydata()[0] for line in mce.lines if line.get_linestyle() == "--"] == [0.05]
     (star,) = [line for line in cd.lines if line.get_marker() == "*"]
@@ -531,5 +573,5 @@ def test_search_figure_shows_choice_and_control(evidence, tmp_path):
     assert trade.get_xlabel() == "Roughness of the field"
     for row in values["curve"]:
         del row["roughness"]
-    figure = ev.search_figure(evidence, ("synbench", "robust_defreg"), [values], "synthetic")
+    figure = figures.search_figure(evidence, ("synbench", "robust_defreg"), [values], "synthetic")
     assert len(figure.axes) == 2

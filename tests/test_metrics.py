@@ -1,14 +1,12 @@
 """Every metric against a closed form or a naive computation."""
 
-import time
-
 import h5py
 import numpy as np
 import pandas as pd
 import pytest
+from samples import POINTS, ball, make_pairs, write_predictions
 
 from dine.data.pairs import (
-    PairSet,
     Variant,
     make_variant,
     read_pairs,
@@ -18,7 +16,7 @@ from dine.data.pairs import (
 )
 from dine.errors import DataError
 from dine.evaluation.metrics import evaluate
-from dine.evaluation.predictions import FORMAT, Prediction, put_prediction, read_predictions
+from dine.evaluation.predictions import Prediction, read_predictions
 from dine.evaluation.quality import (
     agreement,
     chamfer,
@@ -30,16 +28,6 @@ from dine.evaluation.quality import (
     roughness,
 )
 from dine.reporting.tables import COLUMNS, all_tables, load_metrics, to_latex, to_markdown
-
-POINTS = 200
-
-
-def ball(rng, count):
-    points = rng.normal(size=(count, 3))
-    points *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(points, axis=1, keepdims=True)
-    points -= points.mean(axis=0)
-    return points / np.linalg.norm(points, axis=1).max()
-
 
 # ------------------------------------------------------------------------------------ measures
 
@@ -134,39 +122,11 @@ def test_few_or_coinciding_points_have_no_strain():
 # ----------------------------------------------------------------------------------- evaluation
 
 
-def make_pairs(points=POINTS, count=3):
-    rng = np.random.default_rng(0)
-    source = np.stack([ball(rng, points) for _ in range(count)])
-    names = np.array([f"0.5/{i}_1_0.5" for i in range(count)])
-    return PairSet(
-        source=source,
-        target=source + 0.1 * np.sin(3 * source[..., ::-1]),
-        center=np.zeros((count, 3)),
-        scale=np.arange(1.0, count + 1) * 10,
-        level=np.full(count, 0.5),
-        name=names,
-        object=np.array([str(i) for i in range(count)]),
-        split=np.array(["test"] * count),
-        source_file=names,
-        target_file=names,
-        vertex_index=np.zeros((count, points, 3)),
-        vertex_weight=np.zeros((count, points, 3)),
-        attributes={"origin": "synthetic"},
-    )
-
-
 @pytest.fixture
 def stored(tmp_path):
     path = tmp_path / "pairs.h5"
     write_pairs(path, make_pairs())
     return read_pairs(path)
-
-
-def write_predictions(path, predictions):
-    with h5py.File(path, "w") as file:
-        file.attrs["format"] = FORMAT
-        for number, prediction in enumerate(predictions):
-            put_prediction(file.create_group(str(number)), prediction)
 
 
 def run(tmp_path, predictions, variants=(), **arguments):
@@ -334,20 +294,6 @@ def test_subsets_of_variants(tmp_path, stored):
     write_variant(path, noise, "of others")
     with pytest.raises(DataError, match=r"v\.h5 was made from other pairs"):
         read_variant_subset(path, stored)
-
-
-def test_evaluation_is_fast(tmp_path):
-    pairs = make_pairs(1024, 8)
-    write_pairs(tmp_path / "pairs.h5", pairs)
-    field = pairs.displacement + np.float32(0.01)
-    prediction = Prediction("deformation", 0.0, pairs.name, field)
-    start = time.perf_counter()
-    run(tmp_path, [prediction])
-    # A pair takes about 15 ms on one core; the rest is for machines that do other things, too.
-    assert (time.perf_counter() - start) / len(pairs) < 0.2
-
-
-# -------------------------------------------------------------------------------------- tables
 
 
 def test_resampled_rows_break_no_table(tmp_path, stored):

@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
+from dine.models.checkpoint import load_backbone
 from dine.priors.gaussian import LinearGaussian, squared_exponential
 from dine.registration import refine as module
+from dine.registration.calibration import find_field
 from dine.registration.refine import LOOSE, STIFF, expected_error, refine
+from dine.training.stages import shipped_weights
 
 
 def organ(count, seed):
@@ -182,3 +186,16 @@ def test_expected_error():
 def test_the_loose_process_has_more_freedom_than_the_stiff_one():
     points = organ(300, 6)
     assert LOOSE.at(points).kernel.shape[1] > STIFF.at(points).kernel.shape[1]
+
+
+@pytest.mark.parametrize("kind", ["robust_defreg", "deftransnet"])
+def test_the_authors_checkpoint_is_beaten_on_its_own_demo_pairs(shared, kind):
+    path = shared / "published" / "robust_defreg_modelnet10_predictions.npz"
+    with np.load(path) as data:
+        stored = dict(data)
+    backbone, _ = load_backbone(shipped_weights(kind))
+    for name in {key.split("/")[0] for key in stored}:
+        source, target = (stored[f"{name}/{x}"].astype(float) for x in ("source", "target"))
+        truth = target[stored[f"{name}/target_index_of_source"]] - source
+        found, _ = find_field(backbone, source, target, torch.device("cpu"))
+        assert error(found, truth) < 0.5 * error(stored[f"{name}/displacement"], truth)

@@ -1,5 +1,6 @@
 """Two scans in, one registration out."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -17,7 +18,7 @@ from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.evaluation.quality import fit, folding, landmark_errors
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
-from dine.priors.pca import PCAPrior
+from dine.priors import GaussianProcessPrior, PCAPrior
 from dine.registration.calibration import Calibration, load_calibration, plausibility
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
 from dine.registration.register import load_model
@@ -174,11 +175,14 @@ def test_plausibility_separates_inside_from_outside():
     modes = rng.normal(size=(4, 20, 3))
     fields = np.einsum("km,mnd->knd", rng.normal(size=(60, 4)), modes)
     prior = PCAPrior.fit(fields, components=4)
-    inside = plausibility(prior, fields[0])
-    outside = plausibility(prior, fields[0] + rng.normal(size=(20, 3)))
+    source = rng.normal(size=(20, 3))
+    inside = plausibility(prior, fields[0], source)
+    outside = plausibility(prior, fields[0] + rng.normal(size=(20, 3)), source)
     assert inside["residual"] < 1e-6 < 0.01 < outside["residual"]
-    assert plausibility(prior, 10 * fields[0])["in_span"] > 50 * inside["in_span"]
-    assert plausibility(prior, fields[0][:10]) is None
+    assert plausibility(prior, 10 * fields[0], source)["in_span"] > 50 * inside["in_span"]
+    assert plausibility(prior, fields[0][:10], source[:10]) is None
+    on_sources = GaussianProcessPrior.fit(fields, source=np.stack([source] * 60), points=20)
+    assert set(plausibility(on_sources, fields[0], source)) == {"in_span"}
 
 
 # --- whole registrations --------------------------------------------------------------------------
@@ -226,12 +230,14 @@ def test_a_turned_source_is_aligned_first(pair):
 
 def test_further_shapes_and_landmarks_move_along(pair):
     source, target = pair
-    inside = Surface(0.5 * source.vertices[:40], name="tumour")
+    inside = Surface(0.9 * source.vertices[:40], name="tumour")
     marks = source.vertices[::50], target.vertices[::50]
-    found = dine.register(source, target, points=POINTS, apply={"tumour": inside}, landmarks=marks)
+    further = {"tumour": inside, "copy": source.vertices[:40]}
+    found = dine.register(source, target, points=POINTS, apply=further, landmarks=marks)
     truth = bump(inside.vertices)
     after = np.linalg.norm(found.applied["tumour"].vertices - truth, axis=1).mean()
     assert after < np.linalg.norm(inside.vertices - truth, axis=1).mean()
+    np.testing.assert_allclose(found.applied["copy"].vertices, found.moved.vertices[:40])
     assert found.report["landmarks"]["after"]["mean"] < found.report["landmarks"]["before"]["mean"]
     assert found.report["landmarks"]["count"] == len(marks[0])
 
@@ -338,9 +344,11 @@ def test_a_calibration_counts_only_where_it_applies(pair, result):
         assert found.uncertainty is None
         assert not found.trust.percentiles
         assert "no calibration" in " ".join(found.trust.reasons)
-    # Without one the prior's order of points is not known, so nothing is measured with it.
-    other = dine.register(*pair, points=POINTS, model=load_model("deftransnet"))
-    assert "in_span" not in other.report["normalised"]
+    # Without one the prior still measures the field, but there is nothing to compare that with.
+    alone = dataclasses.replace(load_model(), calibration=None)
+    other = dine.register(*pair, points=POINTS, model=alone)
+    assert "in_span" in other.report["normalised"]
+    assert not other.trust.percentiles
 
 
 # --- commands -------------------------------------------------------------------------------------

@@ -85,13 +85,17 @@ def test_stage1_writes_weights_history_and_record(chain):
 
 
 def test_fields_are_the_models_own_on_the_training_split(chain):
-    fields = read_fields(chain / "dvf.h5")
+    stored = read_fields(chain / "dvf.h5")
     train = read_pairs(chain / "pairs.h5", split="train")
     backbone, _ = stages.load_backbone(chain / "stage1" / "model.safetensors")
     again = stages.predict_fields(backbone, train, name="again", batch_size=1)
-    assert fields.shape == train.source.shape
+    assert stored.displacement.shape == train.source.shape
     # Batched or alone, and whatever the order of the target's points.
-    assert np.abs(fields - again).max() < 1e-4
+    assert np.abs(stored.displacement - again.displacement).max() < 1e-4
+    assert (stored.source == train.source).all()
+    assert (stored.true == train.displacement).all()
+    assert (again.spread >= 0).all()
+    assert (again.seconds > 0).all()
 
 
 def test_lambda_is_the_best_candidate_on_validation_pairs(chain):
@@ -148,8 +152,8 @@ def test_precision_is_recorded_and_part_of_the_identity(chain, tmp_path):
     assert exact["final"]["val_cd"] != reduced["final"]["val_cd"]
     model = ("--model", chain / "stage1" / "model.safetensors", "--pairs", chain / "pairs.h5")
     dine("fields", *model, "--precision", "bf16", "--out", tmp_path / "dvf.h5")
-    error = np.abs(read_fields(tmp_path / "dvf.h5") - read_fields(chain / "dvf.h5")).max()
-    assert 0 < error < 0.5
+    reduced, exact = (read_fields(x / "dvf.h5").displacement for x in (tmp_path, chain))
+    assert 0 < np.abs(reduced - exact).max() < 0.5
 
 
 def start_training(chain, out, processes):
@@ -285,13 +289,48 @@ def test_missing_inputs_are_named(chain, tmp_path):
     assert not (tmp_path / "x").exists()
 
 
-def test_a_prior_needs_a_weight_and_a_variant_a_prior(chain, tmp_path):
+def test_a_prior_needs_a_weight_and_the_control_takes_none(chain, tmp_path):
     start = ("stage2", "--pairs", chain / "pairs.h5", "--out", tmp_path)
     model = ("--model", chain / "stage1" / "model.safetensors")
     with pytest.raises(ConfigError, match="--lambda is needed"):
         dine(*start, *model, "--prior", chain / "pca.safetensors", "--variant", "pca")
-    with pytest.raises(ConfigError, match="'pca' needs a prior"):
-        dine(*start, *model, "--variant", "pca")
+    prior = ("--prior", chain / "pca.safetensors", "--lambda", "1")
+    with pytest.raises(ConfigError, match="'lambda0' takes no prior"):
+        dine(*start, *model, *prior)
+
+
+def test_a_variant_may_differ_in_its_data_term_alone(chain, tmp_path):
+    record, weights = run_stage2(
+        chain,
+        tmp_path,
+        *(
+            "--variant",
+            "landau",
+            "--settings",
+            json.dumps(json.loads(STAGE2) | {"data_term": "landau"}),
+        ),
+    )
+    assert record["variant"] == "landau"
+    assert record["lambda"] == 0
+    _, control = run_stage2(chain, tmp_path / "control")
+    assert weights != control
+
+
+@pytest.mark.parametrize(
+    ("fields", "same"), [("predicted", True), ("exact", False), ("shuffled", False)]
+)
+def test_what_a_prior_is_fitted_to(chain, tmp_path, fields, same):
+    settings = {"kind": "pca", "arguments": {"components": 2}, "fields": fields}
+    command = ("fit-prior", "--fields", chain / "dvf.h5", "--settings", json.dumps(settings))
+    dine(*command, "--out", tmp_path / "p.safetensors")
+    stored = read_fields(chain / "dvf.h5")
+    mean = load_prior(tmp_path / "p.safetensors").mean.numpy().reshape(-1, 3)
+    assert np.allclose(mean, stored.displacement.mean(axis=0), atol=1e-6) == same
+    if fields == "exact":
+        assert np.allclose(mean, stored.true.mean(axis=0), atol=1e-6)
+    if fields == "shuffled":
+        # The points of a field, in another order: the mean over all of them stays.
+        assert np.allclose(mean.mean(axis=0), stored.displacement.mean(axis=(0, 1)), atol=1e-6)
 
 
 def test_training_can_start_from_given_weights(chain, tmp_path):
@@ -415,7 +454,8 @@ def test_pretraining_sees_both_kinds_of_targets(chain, resampled, tmp_path):
 def test_fields_of_resampled_targets_differ(chain, resampled, tmp_path):
     model = ("--model", chain / "stage1" / "model.safetensors", "--pairs", chain / "pairs.h5")
     dine("fields", *model, "--targets", resampled, "--out", tmp_path / "dvf.h5")
-    assert (read_fields(tmp_path / "dvf.h5") != read_fields(chain / "dvf.h5")).any()
+    other, own = (read_fields(x / "dvf.h5").displacement for x in (tmp_path, chain))
+    assert (other != own).any()
 
 
 def test_a_prior_is_fitted_to_several_files_of_fields(chain, tmp_path):

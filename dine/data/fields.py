@@ -43,11 +43,13 @@ class TrainingFields:
         displacement: predicted by a Stage-1 model.
         source: the points that move.
         true: their true displacements.
+        convention: the order of the points.
     """
 
     displacement: np.ndarray
     source: np.ndarray
     true: np.ndarray
+    convention: str = "none"
 
 
 def put_fields(group: h5py.Group, pair: np.ndarray, displacement: np.ndarray) -> None:
@@ -74,7 +76,7 @@ def write_training_fields(
 ) -> None:
     """Write the fields of the training split atomically; ``pair`` (K,) names them."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(format=FIELDS_FORMAT, **facts)
+        file.attrs.update(format=FIELDS_FORMAT, convention=fields.convention, **facts)
         put_fields(file, pair, fields.displacement)
         for name, what in (("source", "source points"), ("true", "true displacements")):
             values = getattr(fields, name)
@@ -91,4 +93,5 @@ def read_fields(path: str | os.PathLike) -> TrainingFields:
         DataError: missing, damaged, or another kind of file.
     """
     with opened(path, FIELDS_FORMAT) as file:
-        return TrainingFields(*(file[name][:] for name in ("displacement", "source", "true")))
+        values = (file[name][:] for name in ("displacement", "source", "true"))
+        return TrainingFields(*values, convention=str(file.attrs["convention"]))

@@ -7,6 +7,7 @@ differ by is reported beside. Definitions and sources: docs/metrics.md.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -99,12 +100,20 @@ def cluster_bootstrap(
     if count < 2:
         return float("nan"), float("nan")
     sums = np.bincount(member, weights=differences)
-    # How often each cluster is drawn.
-    drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=samples)
+    drawn = _drawn(count, samples, seed)
     means = (drawn @ sums) / (drawn @ sizes)
     tail = (1 - confidence) / 2
     low, high = np.quantile(means, [tail, 1 - tail])
     return float(low), float(high)
+
+
+@functools.lru_cache(maxsize=8)
+def _drawn(count: int, samples: int, seed: int) -> np.ndarray:
+    """How often each of ``count`` clusters is drawn (samples, count); many tables ask the same."""
+    generator = np.random.default_rng(seed)
+    drawn = generator.multinomial(count, np.full(count, 1 / count), size=samples).astype(float)
+    drawn.setflags(write=False)
+    return drawn
 
 
 def mcnemar(a: np.ndarray, b: np.ndarray) -> float:
@@ -132,7 +141,7 @@ def paired(
     *,
     backbone: str | None = None,
 ) -> pd.DataFrame:
-    """Two methods on the same pairs, within a backbone, each averaged over its seeds.
+    """Two methods on the same pairs, within a backbone, each averaged over the seeds of both.
 
     A method whose rows have the backbone ``none`` is compared with those of every backbone. What
     only one of the two was evaluated on (a whole dataset, backbone, condition or corruption) cannot
@@ -154,15 +163,17 @@ def paired(
         DataError: a column is missing, the methods have nothing in common, a pair was evaluated
             twice, or the two (or two seeds of one) were evaluated on different pairs.
     """
-    aligned, _ = _aligned(metrics, method, reference, value, backbone)
+    aligned, _ = _aligned(_tidy(metrics, [value]), method, reference, value, backbone)
     return aligned
 
 
 def _aligned(
-    metrics: pd.DataFrame, method: str, reference: str, value: str, backbone: str | None
+    rows: pd.DataFrame, method: str, reference: str, value: str, backbone: str | None
 ) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
-    """``paired``, and the values of each seed under ``method`` and ``reference``, same groups."""
-    rows = _tidy(metrics, [value])
+    """``paired``, and the values of each seed under ``method`` and ``reference``, same groups.
+
+    ``rows`` are those of ``_tidy``.
+    """
     ours, theirs = (rows[rows["method"] == name] for name in (method, reference))
     for name, found in ((method, ours), (reference, theirs)):
         if found.empty:
@@ -172,7 +183,7 @@ def _aligned(
         backbones = [name for name in backbones if name == backbone]
     found, seeds = [], {"method": [], "reference": []}
     for name in backbones:
-        mine, other = _of_backbone(ours, name), _of_backbone(theirs, name)
+        mine, other = _of_same_seeds(_of_backbone(ours, name), _of_backbone(theirs, name))
         shared = mine[_GROUP].drop_duplicates().merge(other[_GROUP].drop_duplicates())
         if shared.empty:
             continue
@@ -195,8 +206,20 @@ def _aligned(
 def _of_backbone(rows: pd.DataFrame, backbone: str) -> pd.DataFrame:
     own = rows[rows["backbone"] == backbone]
     if own.empty:
-        own = rows[rows["backbone"] == NO_BACKBONE].assign(backbone=backbone)
-    return own
+        own = rows[rows["backbone"] == NO_BACKBONE]
+    return own.assign(trained=own["backbone"], backbone=backbone)
+
+
+def _of_same_seeds(ours: pd.DataFrame, theirs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """The seeds that both were trained with; all, where one of them needs no training.
+
+    A method that was trained with the first seed alone must not be compared with the mean of three.
+    """
+    common = set(ours["seed"]) & set(theirs["seed"])
+    trained = all((NO_BACKBONE not in set(rows["trained"])) for rows in (ours, theirs))
+    if not trained or not common:
+        return ours, theirs
+    return ours[ours["seed"].isin(common)], theirs[theirs["seed"].isin(common)]
 
 
 def _joined(ours: pd.DataFrame, theirs: pd.DataFrame, value: str) -> pd.DataFrame:
@@ -300,7 +323,9 @@ def compare(
     Raises:
         DataError: see ``paired``.
     """
-    errors, _ = _aligned(metrics, method, reference, "mce", None)
+    rows = _tidy(metrics, ["mce", *values])
+    found = {v: _aligned(rows, method, reference, v, None) for v in dict.fromkeys(["mce", *values])}
+    errors, _ = found["mce"]
     # Pairs without known correspondences can neither fail nor succeed: NaN after the merge.
     failed = errors[[*_GROUP, "pair"]].assign(
         failed_method=(errors["method"] > FAILURE).astype(float),
@@ -308,7 +333,7 @@ def compare(
     )
     records = []
     for value in values:
-        aligned, by_seed = _aligned(metrics, method, reference, value, None)
+        aligned, by_seed = found[value]
         aligned = aligned.merge(failed, on=[*_GROUP, "pair"], how="left")
         spread = {side: _seed_spread(rows, value) for side, rows in by_seed.items()}
         for level, rows in _levels(aligned):
@@ -324,9 +349,9 @@ def compare(
                         **_difference(some, samples, seed),
                         **_failures(some),
                         **{
-                            f"{name}_{side}": found
+                            f"{name}_{side}": number
                             for side in ("method", "reference")
-                            for name, found in spread[side][_hashable(place)].items()
+                            for name, number in spread[side][_hashable(place)].items()
                         },
                     }
                 )
@@ -379,12 +404,15 @@ def _difference(rows: pd.DataFrame, samples: int, seed: int) -> dict[str, float]
 
 def _failures(rows: pd.DataFrame) -> dict[str, float]:
     """The columns of ``compare`` on failures."""
-    known = rows.dropna(subset="failed_method")
-    ours, theirs = known["failed_method"], known["failed_reference"]
+    ours, theirs = rows[["failed_method", "failed_reference"]].to_numpy().T
+    known = ~np.isnan(ours)
+    if not known.any():
+        return dict.fromkeys(("failures_method", "failures_reference", "p_failures"), np.nan)
+    ours, theirs = ours[known], theirs[known]
     return {
         "failures_method": ours.mean(),
         "failures_reference": theirs.mean(),
-        "p_failures": mcnemar(ours, theirs) if len(known) else np.nan,
+        "p_failures": mcnemar(ours, theirs),
     }
 
 

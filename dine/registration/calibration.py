@@ -16,7 +16,7 @@ from dine.evaluation.quality import fit, folding
 from dine.files import file_digest, read_json, write_json
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.models.checkpoint import load_backbone
-from dine.priors import Prior, load_prior
+from dine.priors import PCAPrior, Prior, load_prior
 from dine.progress import Progress
 from dine.registration.refine import ROUNDS, expected_error, refine
 
@@ -30,7 +30,7 @@ class Calibration:
     """Measured on validation pairs of known correspondence, in the normalised frame.
 
     Attributes:
-        spread: (b,) increasing standard deviations of the marginals.
+        spread: (b,) increasing values of what tells errors apart; see :func:`find_field`.
         error: (b,) mean distance of a point of that spread from its true place.
         likely: (b,) 90th percentile of these distances.
         reference: sorted values over validation pairs by name: ``initial`` and ``final`` Chamfer
@@ -77,25 +77,28 @@ def load_calibration(path: Path) -> Calibration:
         raise DataError(f"{path} is not a calibration; make one with `dine calibrate`.") from None
 
 
-def plausibility(prior: Prior, displacement: np.ndarray) -> dict[str, float] | None:
-    """How far a field (N, 3), in the prior's index convention, is from those it was fitted to.
+def plausibility(
+    prior: Prior, displacement: np.ndarray, source: np.ndarray
+) -> dict[str, float] | None:
+    """How far a field (N, 3) of a source (N, 3) is from those that a prior was fitted to.
 
-    ``in_span``: the prior's own penalty (for PCA the squared Mahalanobis distance per component).
-    ``residual``: mean square of what lies outside the principal components, in standard deviations
-    of each coordinate. None where the prior does not fit the number of points.
+    Both are in the prior's index convention. ``in_span``: the prior's own penalty, or with
+    principal components the squared Mahalanobis distance per component. ``residual``: mean square
+    of what lies outside the components, in standard deviations of each coordinate. None where the
+    prior does not fit the number of points.
     """
     tensor = torch.as_tensor(displacement, dtype=torch.float32)[None]
     points = prior.shape.get("points")
     if points is not None and points != len(displacement):
         return None
     with torch.no_grad():
-        penalty = float(prior.penalty(tensor)[0])
-        if not hasattr(prior, "latent"):
-            return {"in_span": penalty}
-        normalised = (tensor.flatten(1) - prior.mean) / prior.scale
-        latent = prior.latent(tensor)
-        residual = float((normalised - latent @ prior.basis).square().mean())
-    return {"in_span": penalty / prior.shape["components"], "residual": residual}
+        if not isinstance(prior, PCAPrior):
+            where = torch.as_tensor(source, dtype=torch.float32)[None]
+            return {"in_span": float(prior.penalty(tensor, source=where)[0])}
+        return {
+            "in_span": float(prior.mahalanobis(tensor)[0]) / prior.shape["components"],
+            "residual": float(prior.residual(tensor)[0]) / tensor.numel(),
+        }
 
 
 @torch.no_grad()
@@ -106,19 +109,24 @@ def find_field(
     device: torch.device,
     rounds: int = ROUNDS,
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Displacement (N, 3) and, where the backbone has marginals, their spread (N,), float64.
+    """Displacement (N, 3) and what tells its errors apart (N,), float64, normalised frame.
 
     The network's field, refined in some rounds (see :func:`~dine.registration.refine.refine`); 0
-    leaves it as it is.
+    leaves it as it is. Errors of the network's own field grow with the standard deviation of its
+    marginals (None from a backbone without). What is left after refinement has little to do with
+    that, but grows with how far a point moved, and with how far the network would have moved it
+    elsewhere: their sum is taken. How well it ranks errors is among the facts of a calibration.
     """
     batch = make_batch([source], [target]).to(device)
     result = backbone.to(device).eval()(batch)
     found = result.displacement[0].double().cpu().numpy()
     deviation = marginal_deviation(backbone, result)
     spread = None if deviation is None else deviation[0].double().cpu().numpy()
-    if rounds:
-        found = refine(source, target, found, expected_error(spread, len(found)), rounds=rounds)
-    return found, spread
+    if rounds == 0:
+        return found, spread
+    refined = refine(source, target, found, expected_error(spread, len(found)), rounds=rounds)
+    elsewhere = np.linalg.norm(refined - found, axis=1)
+    return refined, np.linalg.norm(refined, axis=1) + elsewhere
 
 
 def _measure(
@@ -138,7 +146,7 @@ def _measure(
             goal = goal[np.random.default_rng([3, i]).permutation(len(goal))]
             found, spread = find_field(backbone, source, goal, device)
             if spread is None:
-                raise DataError("This backbone has no marginals; it cannot be calibrated.")
+                raise DataError("This backbone has no marginals; calibrate it with refinement.")
             moved = source + found
             spreads.append(spread)
             errors.append(np.linalg.norm(moved - target, axis=1))
@@ -147,7 +155,7 @@ def _measure(
                 "final": fit(moved, goal)["chamfer"],
                 "reach": float(np.linalg.norm(found, axis=1).max()),
                 "folding": folding(source, found),
-                **((plausibility(prior, found) if prior else None) or {}),
+                **((plausibility(prior, found, source) if prior else None) or {}),
             }
             for key, value in values.items():
                 reference.setdefault(key, []).append(value)
@@ -174,8 +182,9 @@ def calibrate(
     ``targets`` are variants of all pairs of each file, such as resampled ones, to register to.
 
     Raises:
-        DataError: a split has no pairs, or the backbone no marginals.
+        DataError: a split has no pairs.
     """
+    from scipy.stats import spearmanr
     from sklearn.isotonic import IsotonicRegression
 
     backbone, _ = load_backbone(model)
@@ -189,7 +198,7 @@ def calibrate(
     spread, error, reference = measured["val"]
     edges = np.unique(np.quantile(spread, np.linspace(0, 1, _BINS + 1)))
     if len(edges) < 3:
-        raise DataError("The marginals do not differ between points; there is nothing to learn.")
+        raise DataError("All points moved alike; there is nothing to learn errors from.")
     groups = _in_bins(spread, error, edges)
     middle = [float(np.median(group)) for group in _in_bins(spread, spread, edges)]
     weight = [len(group) for group in groups]
@@ -216,6 +225,7 @@ def calibrate(
         validation_pairs=len(measured["val"][2]["initial"]),
         test_pairs=len(measured["test"][2]["initial"]),
         test_inside_likely=inside,
+        test_rank_correlation=float(spearmanr(spread, error).statistic),
         test_mean_error=float(error.mean()),
         test_mean_expected=float(found.expected_error(spread).mean()),
     )
@@ -248,7 +258,7 @@ def _plot(calibration: Calibration, spread: np.ndarray, error: np.ndarray, path:
         label="test pairs: 90th percentile",
     )
     axes.set(
-        xlabel="standard deviation of the marginals (object radii)",
+        xlabel="displacement, plus its distance from the network's (object radii)",
         ylabel="distance from the true place (object radii)",
     )
     axes.legend(frameon=False)

@@ -4,7 +4,7 @@ The network's field is taken as a noisy observation of the true one, and the tru
 a Gaussian prior. Expectation assigns target points to moved source points softly, with a share of
 outliers (as in coherent point drift; Myronenko and Song, 2010); maximisation is one linear solve
 under the prior. Rounds start from a point beyond the last field, along the last step (Nesterov's
-momentum, with restarts), which saves three of four.
+momentum, with restarts), which saves most of them.
 
 First, the field is stiff: few motions are probable, so that few wrong ones are. Two starts guard
 against a network that is mistaken as a whole: its field, and no displacement; the most probable
@@ -29,8 +29,8 @@ from dine.priors.gaussian import LinearGaussian, covariance_root
 
 ROUNDS = 40
 
-# In the normalised frame; chosen on the validation pairs of both synthetic datasets (60) and on 32
-# resampled ones of the pretraining data: docs/evidence.md.
+# In the normalised frame; chosen on the validation pairs of both synthetic datasets (60) and on 40
+# resampled ones of the pretraining data.
 _OUTLIERS = 0.1
 _BOX = 8.0
 _LEAST_ERROR = 0.03

@@ -62,8 +62,8 @@ class Model:
 
     @property
     def convention(self) -> str:
-        """The order of points that the prior was fitted in."""
-        return str(self.calibration.facts["convention"]) if self.calibration else "none"
+        """The order of points that the prior was fitted in; ``none`` where it does not say."""
+        return str(self.prior.notes.get("convention", "none")) if self.prior else "none"
 
 
 def load_model(
@@ -313,9 +313,8 @@ def _result(
         "reach": float(np.linalg.norm(found, axis=1).max()),
         "folding": folding(start, found),
     }
-    # Only the calibration knows in which order of points the prior was fitted.
-    if model.prior is not None and calibration is not None:
-        values |= plausibility(model.prior, found) or {}
+    if model.prior is not None and model.convention != "none":
+        values |= plausibility(model.prior, found, start) or {}
     trust = assess(calibration, values, expected, notes=notes)
     dense_target = _dense(target)
     dense_source = _dense(source)

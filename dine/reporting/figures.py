@@ -69,7 +69,7 @@ def save_figure(figure: Figure, path_stem: str | os.PathLike) -> list[Path]:
     return paths
 
 
-def _new(width: float, height: float, title: str, origin: str, note: str = "") -> Figure:
+def new_figure(width: float, height: float, title: str, origin: str, note: str = "") -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(f"{title} ({tables.ORIGIN_NAMES[origin]})", fontsize=12)
     if note:
@@ -77,7 +77,7 @@ def _new(width: float, height: float, title: str, origin: str, note: str = "") -
     return figure
 
 
-def _plain(axes: Any) -> Any:
+def plain_axes(axes: Any) -> Any:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(True, color="#E5E5E5", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -109,7 +109,7 @@ def distance_figure(dataset: str, metrics: pd.DataFrame, condition: str = "defor
     if len(paper):
         note += f" Hollow, dashed: published means on the real {display_name(dataset)} data."
     names = {"deformation": "increasing deformation", "outliers": "outliers", "noise": "noise"}
-    figure = _new(
+    figure = new_figure(
         5.2 * len(backbones) + 0.4,
         4.3,
         f"{display_name(dataset)}: {names[condition]}",
@@ -147,7 +147,7 @@ def distance_figure(dataset: str, metrics: pd.DataFrame, condition: str = "defor
             ]
         )
         axes.set_ylim(bottom=0)
-        _plain(axes).legend(fontsize=8, frameon=False)
+        plain_axes(axes).legend(fontsize=8, frameon=False)
     panels[0].set_ylabel(f"Chamfer distance {_UNIT}")
     return figure
 
@@ -197,8 +197,8 @@ def histogram_figure(
     # A few stray points must not squeeze the rest: the last bin takes everything beyond.
     top = max(float(np.percentile(e, 99.99, method="lower")) for e in errors.values())
     edge = CD_SCALE * max(top, threshold, np.finfo(np.float32).tiny)
-    figure = _new(6.6, 4.4, title, origin, "The last bin also holds all larger distances.")
-    axes = _plain(figure.subplots())
+    figure = new_figure(6.6, 4.4, title, origin, "The last bin also holds all larger distances.")
+    axes = plain_axes(figure.subplots())
     for method, (colour, _) in method_styles(errors).items():
         axes.hist(
             np.minimum(CD_SCALE * np.ravel(errors[method]), edge),
@@ -308,7 +308,7 @@ def qualitative_figure(examples: Sequence[Example], title: str, origin: str) -> 
     errors = [CD_SCALE * e for example in examples for e in example.squared_distance.values()]
     norm = Normalize(0, float(np.percentile(np.concatenate(errors), 98)))
     columns = 1 + len(methods)
-    figure = _new(
+    figure = new_figure(
         2.6 * columns + 1,
         2.1 * len(examples) + 0.9,
         title,
@@ -392,7 +392,7 @@ def lambda_figure(search: Mapping[str, Any], origin: str) -> Figure:
     columns = [name for name in labels if curve[name].notna().any()]
     title = f"Choice of λ: {display_name(search['dataset'])}, {display_name(search['backbone'])}"
     note = "Validation pairs. Star: chosen λ. Dashed: λ = 0, longer training alone."
-    figure = _new(4.8 * len(columns), 4.2, title, origin, note)
+    figure = new_figure(4.8 * len(columns), 4.2, title, origin, note)
     panels = figure.subplots(1, len(columns), squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
         scale, label = labels[column]
@@ -411,7 +411,7 @@ def lambda_figure(search: Mapping[str, Any], origin: str) -> Figure:
         axes.set_xscale("log")
         axes.set_xlabel("Prior weight λ")
         axes.set_ylabel(label)
-        _plain(axes)
+        plain_axes(axes)
     panels[0].legend()
     return figure
 
@@ -437,7 +437,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
         raise DataError("The training histories hold no values to plot.")
     across = min(3, len(columns))
     down = -(-len(columns) // across)
-    figure = _new(4.2 * across, 3.1 * down + 0.5, title, origin)
+    figure = new_figure(4.2 * across, 3.1 * down + 0.5, title, origin)
     panels = figure.subplots(down, across, squeeze=False).ravel()
     for axes, name in zip(panels, columns, strict=False):
         for method, (colour, _) in method_styles(histories).items():
@@ -453,7 +453,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
             axes.set_yscale("log")
         axes.set_xlabel("Step")
         axes.set_title(known.get(name, name), fontsize=10)
-        _plain(axes)
+        plain_axes(axes)
     for axes in panels[len(columns) :]:
         axes.set_visible(False)
     panels[0].legend(fontsize=8, frameon=False)
@@ -469,7 +469,7 @@ def pca_spectrum_figure(
     """Explained variance per component (log) and its cumulative share."""
     component = np.arange(1, len(explained_variance) + 1)
     cumulative = 100 * np.cumsum(explained_variance_ratio)
-    figure = _new(9.6, 3.8, title, origin)
+    figure = new_figure(9.6, 3.8, title, origin)
     left, right = figure.subplots(1, 2)
     colour = _STYLES["pca"][0]
     left.semilogy(component, explained_variance, color=colour, marker=".")
@@ -485,7 +485,7 @@ def pca_spectrum_figure(
     right.set_ylim(0, 103)
     for axes in (left, right):
         axes.set_xlabel("Component")
-        _plain(axes)
+        plain_axes(axes)
     return figure
 
 
@@ -513,7 +513,7 @@ def pca_modes_figure(
         np.concatenate([(base + sign * s @ rotation) for s in steps for sign in (-1, 1)])
     )
     arrows = np.linspace(0, len(source) - 1, min(len(source), 150)).astype(int)
-    figure = _new(
+    figure = new_figure(
         3.1 * count + 1,
         5.6,
         title,
@@ -550,7 +550,7 @@ def prior_samples_figure(
     base = (source - centre) @ rotation
     limits = _cube(np.concatenate([base * 1.3, base]))
     count = len(samples)
-    figure = _new(3.1 * (count + 1) + 0.8, 3.4, title, origin, "Left: the source as it is.")
+    figure = new_figure(3.1 * (count + 1) + 0.8, 3.4, title, origin, "Left: the source as it is.")
     panels = figure.subplots(1, count + 1, subplot_kw={"projection": "3d"})
     fields = [np.zeros_like(source), *samples]
     for number, (axes, field) in enumerate(zip(panels, fields, strict=True)):

@@ -297,7 +297,12 @@ def dump_fields(
     write_training_fields(
         out,
         train_pairs.name,
-        TrainingFields(fields.displacement, train_pairs.source, train_pairs.displacement),
+        TrainingFields(
+            fields.displacement,
+            train_pairs.source,
+            train_pairs.displacement,
+            str(train_pairs.attributes.get("convention", "none")),
+        ),
         model=file_digest(model),
         pairs=file_digest(pairs),
     )
@@ -308,8 +313,11 @@ def fit_prior(fields: list[Path], prior: PriorConfig, *, seed: int, out: Path) -
     arguments = check_arguments(prior)
     began = time.monotonic()
     parts = [read_fields(path) for path in fields]
-    if len({part.source.shape[1] for part in parts}) > 1:
-        raise DataError("The files of fields hold different numbers of points; fit one at a time.")
+    if len({(part.source.shape[1], part.convention) for part in parts}) > 1:
+        raise DataError(
+            "The files of fields hold different numbers of points or orders of them; fit one at a "
+            "time."
+        )
     source = np.concatenate([part.source for part in parts])
     chosen = [part.true if prior.fields == "exact" else part.displacement for part in parts]
     displacement = np.concatenate(chosen)
@@ -318,6 +326,8 @@ def fit_prior(fields: list[Path], prior: PriorConfig, *, seed: int, out: Path) -
         order = np.random.default_rng([6, seed]).permuted(order, axis=1)
         displacement = np.take_along_axis(displacement, order[..., None], axis=1)
     fitted = PRIORS.get(prior.kind).fit(displacement, seed=seed, source=source, **arguments)
+    # Where a prior is used on other points, these must be brought into its order.
+    fitted.notes["convention"] = parts[0].convention if prior.fields != "shuffled" else "none"
     digests = [file_digest(path) for path in fields]
     fitted.save(out, arguments=arguments, fields=digests, fitted_to=prior.fields, seed=seed)
     log.info("fitted the %s prior in %.1f s", prior.kind, time.monotonic() - began)

@@ -174,6 +174,22 @@ def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
     assert "html" not in jobs
 
 
+def test_the_evidence_is_planned_from_its_config(tmp_path):
+    folder = copy_workflow(tmp_path)
+    jobs = planned(folder, "evidence", "--configfile", TINY)
+    # Two datasets, backbones and seeds; one group of methods without a backbone for each dataset.
+    assert jobs["stage1"] == jobs["stage2_control"] == 8
+    assert jobs["evidence_evaluate"] == 10
+    assert jobs["evidence_classical"] == 4
+    assert jobs["search_lambda"] == 1
+    changes = folder / "changes.yaml"
+    changes.write_text("evidence: {seeds: [0], methods: {cpd: null, map: null}}")
+    fewer = planned(folder, "evidence", "--configfile", TINY, changes)
+    assert fewer["stage1"] == 4
+    assert fewer["evidence_classical"] == 2
+    assert fewer["evidence_refine"] < jobs["evidence_refine"]
+
+
 def test_a_finished_model_is_restored_bit_for_bit(finished):
     model = finished / RESULTS / "synbench/robust_defreg/stage1/model.safetensors"
     before = model.read_bytes()
