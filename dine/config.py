@@ -571,13 +571,19 @@ def validate(values: Any, where: str = "the configuration") -> Config:
     """Check a mapping and fill in defaults.
 
     A dataset, backbone, prior or method that is null is left out: that is how a file laid over
-    another one takes entries away.
+    another one takes entries away. The evidence then forgets the first three, and what needs them.
 
     Raises:
         ConfigError: every fault, with key, value and what was expected.
     """
     if isinstance(values, dict):
+        gone = {
+            key: {name for name, entry in section.items() if entry is None}
+            for key in NAMED
+            if isinstance(section := values.get(key), dict)
+        }
         values = {key: _without_null(key, section) for key, section in values.items()}
+        _forget(values.get("evidence"), gone)
     return validate_section(Config, values, where)
 
 
@@ -589,6 +595,30 @@ def _without_null(key: str, section: Any) -> Any:
     if key in (*NAMED, "methods"):
         return {name: entry for name, entry in section.items() if entry is not None}
     return section
+
+
+def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
+    """Take away from the evidence what was taken away elsewhere, in place."""
+    if not isinstance(evidence, dict):
+        return
+    for section in ("backbones", "methods"):
+        entries = evidence.get(section)
+        if not isinstance(entries, dict):
+            continue
+        kept = {}
+        for name, entry in entries.items():
+            if isinstance(entry, dict):
+                entry = dict(entry)
+                if entry.get("prior") in gone.get("priors", ()):
+                    continue
+                lists = [key for key in NAMED if isinstance(entry.get(key), list)]
+                for key in lists:
+                    entry[key] = [x for x in entry[key] if x not in gone.get(key, ())]
+                # Priors are what a backbone is tried with; without datasets nothing is left.
+                if any(not entry[key] for key in lists if key != "priors"):
+                    continue
+            kept[name] = entry
+        evidence[section] = kept
 
 
 def validate_section(model: type[Section], values: Any, where: str):

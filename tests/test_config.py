@@ -174,6 +174,28 @@ def test_a_null_method_is_left_out():
     assert "bcpd" in loaded.evidence.methods
 
 
+def test_what_is_taken_away_is_forgotten_by_the_evidence():
+    change = {
+        "datasets": {"deformedtissue": None},
+        "priors": {"pca": None, "smoothness": None},
+        "backbones": {"robust_defreg": {"priors": []}, "deftransnet": None},
+        "lambda_search": {"priors": ["flow"]},
+    }
+    loaded = config.validate(config.merge(DEFAULT, change))
+    evidence = loaded.evidence
+    assert "smoothness" not in evidence.methods
+    assert "map_pca" not in evidence.methods
+    assert evidence.backbones["robust_defreg_default"].priors == []
+    assert {cell.dataset for cell in evidence_cells(loaded)} == {"synbench"}
+    without = config.merge(
+        DEFAULT, {"datasets": {"synbench": None}, "lambda_search": {"dataset": "deformedtissue"}}
+    )
+    loaded = config.validate(without)
+    # Both are for that dataset alone.
+    assert "robust_defreg_default" not in loaded.evidence.backbones
+    assert "latent_flow" not in loaded.evidence.methods
+
+
 def test_folders_of_seeds_go_there_and_back():
     loaded = with_evidence()
     assert replica(loaded, "deftransnet", loaded.seed) == "deftransnet"
