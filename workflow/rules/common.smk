@@ -58,12 +58,13 @@ BENCHMARKS = RESULTS / "benchmarks"
 
 # Matches no name.
 NOTHING = "(?!)"
+EVERY_BACKBONE = "|".join(CONFIG.every_backbone)
 
 
 wildcard_constraints:
     dataset="|".join(CONFIG.datasets),
     # Trainings with other seeds than the configuration's lie in folders of their own.
-    backbone="(?:" + "|".join(CONFIG.every_backbone) + r")(?:/seed\d+)?",
+    backbone=rf"(?:{EVERY_BACKBONE})(?:/seed\d+)?",
     prior="|".join(CONFIG.priors),
     prior_of_stage2="|".join(CONFIG.priors_of_stage2) or NOTHING,
     trained="|".join(evidence_names(CONFIG, dine_config.Stage2Method)) or NOTHING,
@@ -297,7 +298,7 @@ def group_predictions(wildcards):
 def group_options(wildcards, input):
     methods = [cell.method for cell in group_cells(wildcards)]
     return (
-        options("--method", methods) + " " + options("--predictions", input.predictions)
+        f"{options('--method', methods)} {options('--predictions', input.predictions)}"
     )
 
 
@@ -316,9 +317,8 @@ def evidence_searches():
         if CONFIG.evidence.methods[name].prior
         and CONFIG.evidence.methods[name].weight is None
     ]
-    return [FILES.search] + [
-        FILES.evidence("lambda", f"{name}.json") for name in searched
-    ]
+    found = [FILES.evidence("lambda", f"{name}.json") for name in searched]
+    return [FILES.search, *found]
 
 
 def evidence_diagnostics():

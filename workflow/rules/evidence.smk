@@ -10,7 +10,7 @@ FIRST_TEST_OBJECT = 2_000_000
 
 
 wildcard_constraints:
-    cell_backbone="|".join(CONFIG.every_backbone),
+    cell_backbone=EVERY_BACKBONE,
     seed=r"\d+",
     network="|".join(
         [
@@ -267,7 +267,7 @@ rule evidence_evaluate:
     log:
         EVIDENCE_LOGS / "{dataset}" / "{group}" / "seed{seed}" / "evaluate.log",
     wildcard_constraints:
-        group="none|" + "|".join(CONFIG.every_backbone),
+        group=f"none|{EVERY_BACKBONE}",
     conda:
         "../envs/dine.yaml"
     params:
