@@ -271,7 +271,10 @@ def _basis(evidence: Evidence) -> Finding:
     note = "All data are synthetic." if len(made) == len(evidence.datasets) else ""
     if made and not note:
         note = f"The data of {join([display_name(d) for d in made])} are synthetic."
-    text = "What this rests on: the same test pairs for all methods, averaged over seeds."
+    text = (
+        "What this rests on: the same test pairs for all methods, averaged over seeds; differences "
+        "are between trainings of the same seeds."
+    )
     return Finding(f"{text} {note}".strip(), tuple(parts))
 
 
