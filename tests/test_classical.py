@@ -69,7 +69,7 @@ class TestEveryMethod:
 
 
 def test_names():
-    assert CLASSICAL.names() == ["bcpd", "cpd", "icp", "unregistered"]
+    assert CLASSICAL.names() == ["bcpd", "cpd", "icp", "smooth", "unregistered"]
 
 
 def test_unregistered_moves_nothing(pair):

@@ -575,3 +575,24 @@ def test_search_figure_shows_choice_and_control(evidence, tmp_path):
         del row["roughness"]
     figure = figures.search_figure(evidence, ("synbench", "robust_defreg"), [values], "synthetic")
     assert len(figure.axes) == 2
+
+
+def test_backbones_of_the_evidence_alone_decide_nothing():
+    metrics = made_up()
+    # With the backbone on trial only the reference and PCA were evaluated.
+    some = metrics[metrics["method"].isin(["lambda0", "pca"])]
+    some = some[some["backbone"] == "deftransnet"].assign(backbone="on_trial")
+    both = pd.concat([metrics, some], ignore_index=True)
+    plain, aside, counted = (
+        Evidence(metrics, METHODS),
+        Evidence(both, METHODS, aside=("on_trial",)),
+        Evidence(both, METHODS),
+    )
+    assert ("synbench", "on_trial") in aside.places
+    assert aside.judged == plain.places
+    methods = list(METHODS)
+    assert aside.ranking(methods, "mce").equals(plain.ranking(methods, "mce"))
+    assert len(counted.ranking(methods, "mce")) < len(plain.ranking(methods, "mce"))
+    assert set(aside.goal["backbone"]) == set(plain.goal["backbone"])
+    assert "on_trial, with which few methods were tried" in said(aside)
+    assert "few methods were tried" not in said(plain)

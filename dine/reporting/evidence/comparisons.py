@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,6 +159,8 @@ class Evidence:
         metrics: as ``load_evidence`` returns them.
         methods: title, group and description by method; see ``build_evidence``.
         reference: what all methods are compared with.
+        aside: backbones that are shown, but neither count for the goal nor for the order of
+            methods.
 
     Raises:
         DataError: the reference is missing, nothing can be compared with it, or a group is unknown.
@@ -169,6 +171,7 @@ class Evidence:
         metrics: pd.DataFrame,
         methods: Mapping[str, Mapping[str, Any]],
         reference: str = CONTROL,
+        aside: Collection[str] = (),
     ):
         self.metrics = metrics
         self.methods = _known_methods(metrics, methods)
@@ -181,6 +184,8 @@ class Evidence:
             )
         self.large_rows = self.clean[self.clean["level"] >= LARGE]
         self.places = self._places()
+        # Few methods are tried with such backbones, so they would decide which can win at all.
+        self.judged = [place for place in self.places if place[1] not in aside] or self.places
         if self.comparisons.empty:
             raise DataError(f"The metrics hold no method to compare with {reference!r}.")
 
@@ -297,7 +302,7 @@ class Evidence:
         """
         records = []
         large = self.cells[self.cells["level"] >= LARGE]
-        for place in self.places:
+        for place in self.judged:
             here = at(self.large_rows, place)
             levels = here.loc[here["method"] == self.reference, "level"].nunique()
             for method in self.rivals:
@@ -360,7 +365,7 @@ class Evidence:
         self, methods: Sequence[str], value: str, places: Sequence[tuple[str, str]] | None = None
     ) -> pd.Series:
         """Mean over places of the mean at large levels, lowest first, of methods seen at all."""
-        places = self.places if places is None else places
+        places = self.judged if places is None else places
         some = self.large_means
         some = some[some["method"].isin(list(methods)) & ~some["partial"]]
         wide = some.pivot(index="method", columns=["dataset", "backbone"], values=f"{value}_mean")

@@ -96,7 +96,7 @@ def forest_figure(evidence: Evidence, place: tuple[str, str]) -> Figure | None:
 
 def main_methods(evidence: Evidence, dataset: str) -> list[str]:
     """Few enough to tell their lines apart: the paper's, and the best of each other group."""
-    places = [place for place in evidence.places if place[0] == dataset]
+    places = [place for place in evidence.judged if place[0] == dataset]
 
     def best(methods: Sequence[str]) -> list[str]:
         return list(evidence.ranking(methods, "mce", places).index[:1])

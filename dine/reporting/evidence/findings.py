@@ -175,6 +175,13 @@ def _goal(evidence: Evidence) -> list[Finding]:
             "one is significantly higher."
         )
         shown = [closest]
+    if len(evidence.judged) < len(evidence.places):
+        judged = {backbone for _, backbone in evidence.judged}
+        aside = sorted({backbone for _, backbone in evidence.places} - judged)
+        text += (
+            f" {join([display_name(name) for name in aside])}, with which few methods were tried, "
+            "do not count here or in the order of methods."
+        )
     return [Finding(text), *_against_classical(evidence, shown)]
 
 
@@ -182,6 +189,7 @@ def _against_classical(evidence: Evidence, methods: Sequence[str]) -> list[Findi
     if not methods:
         return []
     means = evidence.by_level
+    means = pd.concat([at(means, place) for place in evidence.judged])
     classical = means[means["method"].isin(evidence.classical)]
     if classical.empty:
         return [

@@ -281,13 +281,14 @@ def build_evidence(
         diagnostics: what ``diagnose`` found, with ``dataset``, ``backbone`` and ``prior``; a PNG of
             the same name beside is shown as the prior's samples.
         examples: further pictures.
-        config: the resolved configuration.
+        config: the resolved configuration; the backbones under its ``evidence`` are set aside.
 
     Raises:
         DataError: a file cannot be used, see ``load_evidence``, or is of a dataset that the
             metrics do not have; or methods were evaluated on pairs that do not meet.
     """
-    evidence = Evidence(load_evidence(metrics), methods, reference)
+    aside = ((config or {}).get("evidence") or {}).get("backbones") or {}
+    evidence = Evidence(load_evidence(metrics), methods, reference, tuple(aside))
     known = set(evidence.datasets)
     found = [_read(path, ("dataset", "backbone", "curve"), known) for path in searches]
     diagnosed = []
