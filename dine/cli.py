@@ -44,21 +44,14 @@ class Settings(click.ParamType):
         return config.validate_section(self.model, values, "--settings")
 
 
-class Mapping(click.ParamType):
-    """Keys and values as JSON text."""
-
-    name = "JSON"
-
-    def convert(self, value, param, ctx):
-        if isinstance(value, dict):
-            return value
-        try:
-            values = json.loads(value)
-        except ValueError as error:
-            raise ConfigError(f"--{param.name} is not JSON: {error}.") from None
-        if not isinstance(values, dict):
-            raise ConfigError(f"--{param.name}: expected keys and values, found {value}.")
-        return values
+def _json_or_file(context, parameter, value):
+    """JSON text, or a JSON or YAML file, with or without @ before its name."""
+    if value is None or not value.lstrip().startswith("{"):
+        return None if value is None else config.read_yaml(value.removeprefix("@"))
+    try:
+        return json.loads(value)
+    except ValueError as error:
+        raise ConfigError(f"{parameter.opts[0]} is neither JSON nor a file: {error}.") from None
 
 
 def settings_option(model: type[config.Section]):
@@ -595,7 +588,14 @@ def refine_predictions(predictions, pairs, variants, settings, prior, name, out)
 @pairs_option
 @variants_option
 @click.option("--algorithm", required=True, help="unregistered, icp, cpd, bcpd, smooth, or a path.")
-@click.option("--arguments", type=Mapping(), default="{}", help="Of the algorithm, as JSON.")
+@click.option(
+    "--arguments",
+    callback=_json_or_file,
+    default="{}",
+    show_default=False,
+    metavar="JSON|FILE",
+    help="Of the algorithm.",
+)
 @name_option
 @click.option("--out", type=OUT, required=True, help="Predictions to write (HDF5).")
 def classical(pairs, variants, algorithm, arguments, name, out):
@@ -673,16 +673,6 @@ def report(results, settings, out):
     from dine.reporting.build import build_report
 
     build_report(results, settings, out)
-
-
-def _json_or_file(context, parameter, value):
-    """JSON text, or a JSON or YAML file, with or without @ before its name."""
-    if value is None or not value.lstrip().startswith("{"):
-        return None if value is None else config.read_yaml(value.removeprefix("@"))
-    try:
-        return json.loads(value)
-    except ValueError as error:
-        raise ConfigError(f"{parameter.opts[0]} is neither JSON nor a file: {error}.") from None
 
 
 @cli.command()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -102,10 +102,18 @@ def load_metrics(paths: Iterable[str | os.PathLike]) -> pd.DataFrame:
             files contradict each other.
     """
     frames = [_load_one(Path(path)) for path in paths]
+    return combined(frames, ["dataset", *_SERIES, "condition", "corruption", "pair"])
+
+
+def combined(frames: Sequence[pd.DataFrame], key: list[str]) -> pd.DataFrame:
+    """The rows of all frames; columns ``key`` tell evaluations apart.
+
+    Raises:
+        DataError: no frames, the same evaluation in two rows, or a dataset of mixed origins.
+    """
     if not frames:
         raise DataError("No metrics files were given; evaluate a model first.")
     metrics = pd.concat(frames, ignore_index=True)
-    key = ["dataset", *_SERIES, "condition", "corruption", "pair"]
     repeated = metrics[metrics.duplicated(key)]
     if len(repeated):
         what = ", ".join(f"{name} {value}" for name, value in repeated.iloc[0][key].items())

@@ -54,21 +54,7 @@ def load_evidence(paths: Iterable[Path]) -> pd.DataFrame:
         DataError: a file is missing, lacks a column or holds values that cannot be used, the same
             evaluation stands in two rows, or a dataset mixes origins.
     """
-    frames = [_load_one(Path(path)) for path in paths]
-    if not frames:
-        raise DataError("No metrics files were given; evaluate a model first.")
-    metrics = pd.concat(frames, ignore_index=True)
-    repeated = metrics[metrics.duplicated(_KEYS)]
-    if len(repeated):
-        what = ", ".join(f"{name} {value}" for name, value in repeated.iloc[0][_KEYS].items())
-        raise DataError(f"The metrics files hold the same evaluation twice ({what}).")
-    for dataset, found in metrics.groupby("dataset")["origin"].unique().items():
-        if len(found) > 1:
-            raise DataError(
-                f"The metrics files of {dataset} mix data of different origins "
-                f"({', '.join(sorted(found))}); their numbers cannot stand in one table."
-            )
-    return metrics
+    return tables.combined([_load_one(Path(path)) for path in paths], _KEYS)
 
 
 def _load_one(path: Path) -> pd.DataFrame:
