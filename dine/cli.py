@@ -205,9 +205,11 @@ def config_write(settings: config.Config, out: Path):
 
 
 @cli.command()
-@click.argument("folder", type=FOLDER)
+@click.argument("folder", type=click.Path(path_type=Path))
 def inspect(folder: Path):
     """List what a folder of meshes holds, per condition and level, and what is left out and why.
+
+    A manifest (CSV) of pairs will do as well.
 
     Example: dine inspect ~/scans/liver
     """
@@ -675,9 +677,7 @@ def report(results, settings, out):
     build_report(results, settings, out)
 
 
-@cli.command()
-@click.argument("metrics", nargs=-1, required=True, type=IN)
-@click.option(
+methods_option = click.option(
     "--methods",
     callback=_json_or_file,
     default="{}",
@@ -685,6 +685,34 @@ def report(results, settings, out):
     metavar="JSON|FILE",
     help="Title, group and description of each method.",
 )
+
+
+@cli.command()
+@pairs_option
+@variants_option
+@click.option("--method", "names", multiple=True, required=True, help="One of each predictions.")
+@click.option("--predictions", type=IN, multiple=True, required=True, help="Of `predict`.")
+@methods_option
+@click.option("--dataset", required=True, help="For the title.")
+@click.option("--out", type=OUT, required=True, help="Views to write (PNG; a PDF beside it).")
+def examples(pairs, variants, names, predictions, methods, dataset, out):
+    """Draw what some methods make of typical test pairs; the first one says which are typical.
+
+    Example: dine examples --pairs pairs.h5 --method cpd --predictions cpd.h5 --dataset synbench
+    --out examples.png
+    """
+    from dine.reporting.evidence import draw_examples
+
+    if len(names) != len(predictions):
+        raise click.UsageError("Give as many --method as --predictions.")
+    titles = {name: about.get("title") or name for name, about in methods.items()}
+    named = dict(zip(names, predictions, strict=True))
+    draw_examples(pairs, list(variants), named, out, titles=titles, dataset=dataset)
+
+
+@cli.command()
+@click.argument("metrics", nargs=-1, required=True, type=IN)
+@methods_option
 @click.option("--reference", default=config.CONTROL, help="What methods are compared with.")
 @click.option("--search", "searches", type=IN, multiple=True, help="Of `search-lambda`.")
 @click.option("--diagnostics", type=IN, multiple=True, help="JSON of a prior; repeatable.")

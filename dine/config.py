@@ -363,6 +363,15 @@ class EvidenceBackbone(BackboneConfig):
     """How many of the seeds, from the first on; by default all."""
 
 
+class TestSet(Section):
+    """Pairs of known correspondence that nothing is trained on."""
+
+    folder: str
+    """Folder in the published layout, or a manifest (CSV): source, target, level and object."""
+    networks: str
+    """Dataset whose networks, priors and settings of `pairs` are used."""
+
+
 class Evidence(Section):
     """`snakemake -j2 evidence`: does a prior help, which, and how sure are we?"""
 
@@ -382,11 +391,15 @@ class Evidence(Section):
     """Outliers in percent of the points."""
     resampled: bool = True
     """Also register to targets whose points were drawn anew, as two scans share none."""
+    test_sets: dict[str, TestSet] = {}
+    """Further data to evaluate on; shown, but without a say in which method wins."""
     backbones: dict[str, EvidenceBackbone] = {}
     """Backbones for the evidence alone, such as one that starts elsewhere."""
     choice: LambdaChoice = LambdaChoice(criterion="mce")
     """How each method's λ is chosen, on the dataset and backbone of `lambda_search`."""
     methods: dict[str, AnyMethod] = {}
+    examples: list[str] = [CONTROL]
+    """Methods whose fields are drawn for typical pairs; those of the first one are typical."""
 
 
 class Compute(Section):
@@ -468,6 +481,13 @@ class Config(Compute):
                 self._known("priors", prior, f"evidence.backbones.{name}.priors")
             for dataset in backbone.datasets or ():
                 self._known("datasets", dataset, f"evidence.backbones.{name}.datasets")
+        for name, data in self.evidence.test_sets.items():
+            if name in self.datasets or not _NAME.match(name):
+                raise ValueError(
+                    f"`evidence.test_sets.{name}` must have a name of its own, of lower-case "
+                    "letters, digits and underscores"
+                )
+            self._known("datasets", data.networks, f"evidence.test_sets.{name}.networks")
         for name, method in self.evidence.methods.items():
             where = f"evidence.methods.{name}"
             if name in taken or not _NAME.match(name):
@@ -499,10 +519,23 @@ class Config(Compute):
                         f"{', '.join(sorted(trained))}"
                     )
 
+        known = {*taken, *self.evidence.methods}
+        unknown = [name for name in self.evidence.examples if name not in known]
+        if unknown:
+            raise ValueError(
+                f"`evidence.examples` names {unknown[0]!r}, which is no method; expected some of "
+                f"{', '.join(sorted(known))}"
+            )
+
     @property
     def every_backbone(self) -> dict[str, BackboneConfig]:
         """All backbones, those of the evidence last."""
         return {**self.backbones, **self.evidence.backbones}
+
+    def networks(self, dataset: str) -> str:
+        """The dataset whose networks are evaluated on a dataset: itself, but for test sets."""
+        test_set = self.evidence.test_sets.get(dataset)
+        return test_set.networks if test_set else dataset
 
     @property
     def priors_of_stage2(self) -> list[str]:
@@ -582,6 +615,10 @@ def validate(values: Any, where: str = "the configuration") -> Config:
             for key in NAMED
             if isinstance(section := values.get(key), dict)
         }
+        evidence = values.get("evidence")
+        methods = evidence.get("methods") if isinstance(evidence, dict) else None
+        if isinstance(methods, dict):
+            gone["methods"] = {name for name, entry in methods.items() if entry is None}
         values = {key: _without_null(key, section) for key, section in values.items()}
         _forget(values.get("evidence"), gone)
     return validate_section(Config, values, where)
@@ -592,7 +629,7 @@ def _without_null(key: str, section: Any) -> Any:
         return section
     if key == "evidence":
         return {inner: _without_null(inner, entry) for inner, entry in section.items()}
-    if key in (*NAMED, "methods"):
+    if key in (*NAMED, "methods", "test_sets"):
         return {name: entry for name, entry in section.items() if entry is not None}
     return section
 
@@ -601,6 +638,13 @@ def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
     """Take away from the evidence what was taken away elsewhere, in place."""
     if not isinstance(evidence, dict):
         return
+    sets = evidence.get("test_sets")
+    if isinstance(sets, dict):
+        evidence["test_sets"] = {
+            name: entry
+            for name, entry in sets.items()
+            if not isinstance(entry, dict) or entry.get("networks") not in gone.get("datasets", ())
+        }
     for section in ("backbones", "methods"):
         entries = evidence.get(section)
         if not isinstance(entries, dict):
@@ -618,7 +662,12 @@ def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
                 if any(not entry[key] for key in lists if key != "priors"):
                     continue
             kept[name] = entry
+        if section == "methods":
+            gone.setdefault(section, set()).update(entries.keys() - kept)
         evidence[section] = kept
+    if isinstance(evidence.get("examples"), list):
+        lost = gone.get("methods", set()) | gone.get("priors", set())
+        evidence["examples"] = [name for name in evidence["examples"] if name not in lost]
 
 
 def validate_section(model: type[Section], values: Any, where: str):

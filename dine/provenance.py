@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import functools
 import hashlib
 import os
 import platform
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from dine import __version__
 
 PACKAGE = Path(__file__).parent
 
-_READING = ("data/surface.py", "data/readers.py", "data/layout.py")
+_READING = ("data/surface.py", "data/readers.py", "data/manifest.py", "data/layout.py")
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # What a step's result depends on, as paths below the package.
@@ -80,18 +82,33 @@ def versions() -> dict[str, str]:
 
 
 def folder_signature(folder: str | os.PathLike) -> str:
-    """Digest of the names, sizes and times of all files below a folder; contents are not read."""
+    """Digest of the names, sizes and times of all files below a folder; contents are not read.
+
+    Of a manifest (CSV) it is that of the file and of those that it lists.
+    """
     digest = hashlib.sha256()
+    for path in _listed(folder) if os.path.isfile(folder) else _below(folder):
+        try:
+            stat = os.stat(path)
+        except OSError:
+            continue
+        digest.update(f"{path}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _below(folder: str | os.PathLike) -> Iterator[str]:
     for root, folders, files in os.walk(folder):
         folders.sort()
-        for name in sorted(files):
-            path = os.path.join(root, name)
-            try:
-                stat = os.stat(path)
-            except OSError:
-                continue
-            digest.update(f"{path}\0{stat.st_size}\0{stat.st_mtime_ns}\n".encode())
-    return digest.hexdigest()[:16]
+        yield from (os.path.join(root, name) for name in sorted(files))
+
+
+def _listed(manifest: str | os.PathLike) -> Iterator[str]:
+    yield str(manifest)
+    # Whoever reads the pairs says what is wrong with it.
+    with open(manifest, newline="", errors="replace") as file:
+        for row in csv.DictReader(file):
+            for column in ("source", "target"):
+                yield os.path.join(os.path.dirname(manifest), str(row.get(column)))
 
 
 def run_record(settings: dict[str, Any], seed: int, **facts: Any) -> dict[str, Any]:

@@ -91,12 +91,13 @@ def evidence_cells(config: Config) -> list[Cell]:
     """Every evaluation of the evidence."""
     evidence = config.evidence
     cells = []
-    for dataset in config.datasets:
+    for dataset in [*config.datasets, *evidence.test_sets]:
+        trained = config.networks(dataset)
         for name, method in evidence.methods.items():
-            if isinstance(method, ClassicalMethod) and dataset in (method.datasets or [dataset]):
+            if isinstance(method, ClassicalMethod) and trained in (method.datasets or [trained]):
                 cells.append(Cell(dataset, NO_BACKBONE, 0, name))
         for backbone, settings in config.every_backbone.items():
-            if dataset not in (getattr(settings, "datasets", None) or [dataset]):
+            if trained not in (getattr(settings, "datasets", None) or [trained]):
                 continue
             for number, seed in enumerate(evidence.seeds[: getattr(settings, "seeds", None)]):
                 names = config.methods(backbone)
@@ -106,18 +107,26 @@ def evidence_cells(config: Config) -> list[Cell]:
                     if isinstance(method, ClassicalMethod):
                         continue
                     fits = backbone in (method.backbones or config.backbones)
-                    fits &= dataset in (method.datasets or [dataset])
+                    fits &= trained in (method.datasets or [trained])
                     if fits and number < (method.seeds or len(evidence.seeds)):
                         names.append(name)
                 cells += [Cell(dataset, backbone, seed, name) for name in names]
     return cells
 
 
-def evidence_conditions(config: Config) -> list[tuple[str, float]]:
-    """The corrupted conditions of the evidence, and that of targets with other points."""
+def evidence_conditions(config: Config, dataset: str) -> list[tuple[str, float]]:
+    """The corrupted conditions of the evidence, and that of targets with other points.
+
+    Test sets are corrupted by nothing: their levels are their own.
+    """
     evidence = config.evidence
-    found = [("noise", x) for x in evidence.noise] + [("outliers", x) for x in evidence.outliers]
-    return found + ([("resampled", 1.0)] if evidence.resampled else [])
+    found = [("resampled", 1.0)] if evidence.resampled else []
+    if dataset in evidence.test_sets:
+        return found
+    noise, outliers = (
+        [(kind, x) for x in getattr(evidence, kind)] for kind in ("noise", "outliers")
+    )
+    return [*noise, *outliers, *found]
 
 
 def evidence_names(config: Config, kind: type) -> list[str]:

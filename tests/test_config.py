@@ -12,6 +12,7 @@ from dine.results import (
     NO_BACKBONE,
     backbone_and_seed,
     evidence_cells,
+    evidence_conditions,
     figure_names,
     replica,
     table_names,
@@ -194,6 +195,39 @@ def test_what_is_taken_away_is_forgotten_by_the_evidence():
     # Both are for that dataset alone.
     assert "robust_defreg_default" not in loaded.evidence.backbones
     assert "latent_flow" not in loaded.evidence.methods
+
+
+def test_test_sets_are_evaluated_with_the_networks_of_another_dataset():
+    test_sets = {"real": {"folder": "pairs.csv", "networks": "synbench"}}
+    loaded = with_evidence(test_sets=test_sets)
+    cells = evidence_cells(loaded)
+    on = {name: {c[1:] for c in cells if c.dataset == name} for name in ("real", "synbench")}
+    assert on["real"] == on["synbench"]
+    assert loaded.networks("real") == loaded.networks("synbench") == "synbench"
+    # Corruption is for levels that test sets need not have.
+    assert evidence_conditions(loaded, "real") == [("resampled", 1.0)]
+    assert evidence_conditions(loaded, "synbench")[0] == ("noise", 0.03)
+    with pytest.raises(ConfigError, match=r"test_sets\.real\.networks` names 'other'"):
+        with_evidence(test_sets={"real": {"folder": "x", "networks": "other"}})
+    with pytest.raises(ConfigError, match="name of its own"):
+        with_evidence(test_sets={"synbench": {"folder": "x", "networks": "synbench"}})
+    assert with_evidence(test_sets={"real": None}).evidence.test_sets == {}
+    without = {
+        "datasets": {"synbench": None},
+        "lambda_search": {"dataset": "deformedtissue"},
+        "evidence": {"test_sets": test_sets},
+    }
+    assert config.validate(config.merge(DEFAULT, without)).evidence.test_sets == {}
+
+
+def test_examples_name_methods():
+    with pytest.raises(ConfigError, match="examples` names 'cdp', which is no method"):
+        with_evidence(examples=["cdp"])
+    # What was taken away is not missed.
+    loaded = with_evidence(methods={"cpd": None}, examples=["lambda0", "cpd", "map"])
+    assert loaded.evidence.examples == ["lambda0", "map"]
+    change = {"priors": {"smoothness": None}, "evidence": {"examples": ["smoothness", "map"]}}
+    assert config.validate(config.merge(DEFAULT, change)).evidence.examples == ["map"]
 
 
 def test_folders_of_seeds_go_there_and_back():

@@ -594,5 +594,18 @@ def test_backbones_of_the_evidence_alone_decide_nothing():
     assert aside.ranking(methods, "mce").equals(plain.ranking(methods, "mce"))
     assert len(counted.ranking(methods, "mce")) < len(plain.ranking(methods, "mce"))
     assert set(aside.goal["backbone"]) == set(plain.goal["backbone"])
-    assert "on_trial, with which few methods were tried" in said(aside)
+    assert "on_trial, with few methods or pairs, does not count" in said(aside)
     assert "few methods were tried" not in said(plain)
+
+
+def test_test_sets_are_shown_and_decide_nothing():
+    metrics = made_up()
+    few = metrics[metrics["dataset"] == "synbench"].assign(dataset="scans", origin="path")
+    both = pd.concat([metrics, few[few["level"] < 0.4]], ignore_index=True)
+    plain, aside = Evidence(metrics, METHODS), Evidence(both, METHODS, aside=("scans",))
+    assert {place for place in aside.places if place[0] == "scans"}
+    assert aside.judged == plain.places
+    assert aside.ranking(list(METHODS), "cd").equals(plain.ranking(list(METHODS), "cd"))
+    assert aside.goal.equals(plain.goal)
+    assert "scans, with few methods or pairs, does not count" in said(aside)
+    assert "data supplied by the user" in aside.where("scans")

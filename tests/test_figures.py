@@ -160,7 +160,7 @@ def test_examples_are_matched_by_pair_name(stored):
     pairs, predictions, errors, displacement, squared = stored
     (example,) = figures.load_examples([("noise_0.04", "a", "Noise")], pairs, predictions, errors)
     np.testing.assert_allclose(example.registered["pca"], pairs.source[0] + displacement[1])
-    np.testing.assert_array_equal(example.squared_distance["pca"], squared[1])
+    np.testing.assert_array_equal(example.errors["pca"], 1e4 * squared[1])
     np.testing.assert_array_equal(example.target, pairs.target[0])
     with pytest.raises(DataError, match="Pair c is not in the pairs"):
         figures.load_examples([("noise_0.04", "c", "")], pairs, predictions, errors)

@@ -408,3 +408,40 @@ def test_check_pair():
         check_pair(source, Surface(target.vertices, faces[:, ::-1]), "1_5_0.3")
     with pytest.raises(DataError, match="different faces"):
         check_pair(source, Surface(target.vertices, faces[:1]), "1")
+
+
+# --- manifests ------------------------------------------------------------------------------------
+
+
+def test_a_manifest_lists_pairs_of_any_name(make):
+    folder = make("scans/before.ply", "scans/after.ply", "other/after.ply")
+    manifest = folder / "pairs.csv"
+    manifest.write_text(
+        "source,target,level,object,name\n"
+        "scans/before.ply,scans/after.ply,0.1,,\n"
+        "scans/before.ply,other/after.ply,0.25,liver,second\n"
+    )
+    found = scan(manifest)
+    assert numbers(found) == [("deformation", None, 0.1), ("deformation", None, 0.25)]
+    assert [p.object for p in found.pairs] == ["scans/before.ply", "liver"]
+    assert [p.name for p in found.pairs] == ["before_to_after", "second"]
+    assert found.pairs[1].target == folder / "other/after.ply"
+    assert found.folder == folder
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("", "lists no pairs"),
+        ("a.ply,missing.ply,0.1\n", "missing.ply, which is not there"),
+        ("a.ply,a.ply,strong\n", "row 1: the level is 'strong'"),
+        ("a.ply,a.ply,nan\n", "row 1: the level is 'nan'"),
+        ("a.ply,a.ply,-1\n", "row 1: the level is '-1'"),
+        ("a.ply,,1\n", "row 1: expected a source, a target"),
+    ],
+)
+def test_bad_manifests(make, rows, said):
+    manifest = make("a.ply") / "pairs.csv"
+    manifest.write_text(f"source,target,level\n{rows}")
+    with pytest.raises(DataError, match=said):
+        scan(manifest)

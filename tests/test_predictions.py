@@ -17,6 +17,7 @@ from dine.evaluation.predictions import Prediction, read_predictions
 from dine.files import read_json
 from dine.priors import PRIORS
 from dine.registration.predictions import classical_predictions, refine_predictions
+from dine.reporting.evidence.examples import typical
 
 
 def dine(*arguments):
@@ -146,3 +147,36 @@ def test_a_prior_is_diagnosed_and_drawn(tmp_path):
             *("diagnose", "--prior", tmp_path / "prior.safetensors", "--pairs"),
             *(tmp_path / "test.h5", "--fields", tmp_path / "dvf.h5", "--out", tmp_path / "x.json"),
         )
+
+
+# --- views ----------------------------------------------------------------------------------------
+
+
+def test_views_show_the_median_pair_of_the_first_method(stored, tmp_path):
+    """One row for each condition; the same pair for every method, coloured by its true error."""
+    write_pairs(tmp_path / "equal.h5", make_pairs(count=5))
+    pairs = read_pairs(tmp_path / "equal.h5")
+    offset = np.array([0.05, 0.01, 0.02, 0.04, 0.03])[:, None, None] * [1.0, 0, 0]
+    condition = evaluation_conditions(tmp_path / "equal.h5", [])[0]
+    fields = {
+        name: Prediction("deformation", 0.0, pairs.name, pairs.displacement + factor * offset)
+        for name, factor in (("first", 1), ("second", 2))
+    }
+    example = typical(condition, fields)
+    np.testing.assert_array_equal(example.source, pairs.source[4])
+    np.testing.assert_allclose(example.errors["first"], 0.03, atol=1e-6)
+    np.testing.assert_allclose(example.errors["second"], 0.06, atol=1e-6)
+    assert example.label == "Clean\nlevel 0.5"
+    assert example.seen is None
+
+
+def test_views_of_every_condition(stored, tmp_path):
+    out = tmp_path / "views" / "examples.png"
+    arguments = ("examples", "--pairs", tmp_path / "pairs.h5", "--method", "net")
+    arguments += ("--predictions", tmp_path / "network.h5", "--dataset", "synbench", "--out", out)
+    dine(*arguments, "--variant", tmp_path / "noise.h5", "--methods", '{"net": {"title": "Half"}}')
+    assert out.stat().st_size > 10_000
+    assert out.with_suffix(".pdf").exists()
+    write_variant(tmp_path / "more.h5", make_variant(stored, "noise", 0.02, 0), stored.checksum)
+    with pytest.raises(DataError, match=r"network\.h5 has not predicted these pairs under noise_0"):
+        dine(*arguments, "--variant", tmp_path / "more.h5")

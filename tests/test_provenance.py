@@ -73,6 +73,23 @@ def test_folder_signature_sees_files_come_go_and_change(tmp_path):
     assert folder_signature(tmp_path) == seen[-1]
 
 
+def test_signature_of_a_manifest_sees_the_files_that_it_lists(tmp_path):
+    (tmp_path / "lists").mkdir()
+    manifest = tmp_path / "lists" / "pairs.csv"
+    manifest.write_text("source,target\n../a.ply,../b.ply\n")
+    seen = [folder_signature(manifest)]
+    for name in ("a.ply", "b.ply"):
+        (tmp_path / name).write_text(name)
+        seen.append(folder_signature(manifest))
+    (tmp_path / "c.ply").write_text("not listed")
+    assert folder_signature(manifest) == seen[-1]
+    manifest.write_text("source,target\n../a.ply,../c.ply\n")
+    seen.append(folder_signature(manifest))
+    assert len(set(seen)) == 4
+    manifest.write_bytes(b"nothing\xff\n1,2,3\n")
+    assert folder_signature(manifest)
+
+
 def test_versions_name_what_results_depend_on():
     assert {"dine", "python", "torch", "numpy", "numba"} <= set(versions())
 

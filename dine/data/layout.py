@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dine.data.manifest import read_manifest
 from dine.data.readers import READABLE_SUFFIXES
 from dine.data.surface import Surface
 from dine.errors import DataError
@@ -117,13 +118,19 @@ def scan(folder: str | os.PathLike) -> Inventory:
 
     Names that begin with a dot are skipped. Links to folders are followed, each folder once.
 
+    A manifest (:func:`dine.data.manifest.read_manifest`) is a list of pairs without such names.
+
     Args:
-        folder: the dataset, or any folder below it such as ``Deformation_Level/0.3``.
+        folder: the dataset, or any folder below it such as ``Deformation_Level/0.3``; or the CSV
+            file of a manifest.
 
     Raises:
-        DataError: the folder is missing or holds nothing usable, or its split file is malformed.
+        DataError: the folder is missing or holds nothing usable, or its split file or the manifest
+            is malformed.
     """
     folder = Path(folder)
+    if folder.suffix.lower() == ".csv" and folder.is_file():
+        return _listed(folder)
     if not folder.is_dir():
         raise DataError(
             f"{folder} is not a folder; expected a dataset with Source_ and Target_ files, or a "
@@ -147,6 +154,24 @@ def scan(folder: str | os.PathLike) -> Inventory:
     _attach_split(inventory, split_files)
     inventory.left_out.sort()
     return inventory
+
+
+def _listed(manifest: Path) -> Inventory:
+    """What a manifest lists; a file that is not there is an error, since it was asked for."""
+    pairs = read_manifest(manifest)
+    if not pairs:
+        raise DataError(f"{manifest} lists no pairs.")
+    for path in (path for pair in pairs for path in (pair.source, pair.target)):
+        if not path.is_file():
+            raise DataError(f"{manifest} lists {path}, which is not there.")
+    found = [
+        PairFiles(
+            *(pair.object, pair.name, "deformation", pair.level, None, None, None),
+            *(pair.source, pair.target),
+        )
+        for pair in pairs
+    ]
+    return Inventory(manifest.parent, pairs=found)
 
 
 def check_pair(source: Surface, target: Surface, name: str) -> None:

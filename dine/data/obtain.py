@@ -62,7 +62,7 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
     if not inventory.has_pairs:
         raise DataError(
             f"{place} holds no Source_/Target_ pairs; expected the published layout "
-            "(Deformation_Level/<level>/Source_… and Target_…)."
+            "(Deformation_Level/<level>/Source_… and Target_…), or a manifest (CSV)."
         )
     report(inventory, folder)
     write_json(folder / "raw.json", {"folder": str(place), "origin": origin})

@@ -250,8 +250,8 @@ class _Sampler:
         """The columns of one pair that come from its surfaces."""
         if files.level is None:
             raise DataError(
-                f"{files.target} has no deformation level in its path; put it into a folder named "
-                "after the level, such as Deformation_Level/0.3."
+                f"{files.target} has no deformation level; put it into a folder named after the "
+                "level, such as Deformation_Level/0.3, or give a manifest the column 'level'."
             )
         source, target = read_surface(files.source), read_surface(files.target)
         check_pair(source, target, files.name)

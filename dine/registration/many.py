@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 
 from dine.data.layout import scan
+from dine.data.manifest import read_manifest
 from dine.errors import DataError, DineError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json
 from dine.progress import Progress
@@ -48,7 +49,7 @@ def read_jobs(path: Path) -> list[Job]:
             if pair.condition == "deformation"
         ]
     else:
-        jobs = _read_manifest(path)
+        jobs = [Job(pair.name, pair.source, pair.target) for pair in read_manifest(path)]
     if not jobs:
         raise DataError(f"{path} names no pairs of a source and a target.")
     repeated = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
@@ -57,26 +58,6 @@ def read_jobs(path: Path) -> list[Job]:
             f"{path}: {len(repeated)} names are used by several pairs, such as {repeated[0]!r}; "
             "give every row a name of its own."
         )
-    return jobs
-
-
-def _read_manifest(path: Path) -> list[Job]:
-    try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} is not a readable CSV file ({error}).") from None
-    missing = [column for column in ("source", "target") if column not in table]
-    if missing:
-        raise DataError(f"{path} lacks the column {missing[0]!r}; expected source and target.")
-    jobs = []
-    for number, row in enumerate(table.to_dict("records"), start=1):
-        source, target = (path.parent / row[key] for key in ("source", "target"))
-        name = row.get("name") or f"{source.stem}_to_{target.stem}"
-        if not row["source"] or not row["target"] or Path(name).name != name:
-            raise DataError(
-                f"{path}, row {number}: expected a source, a target and, if any, a plain name."
-            )
-        jobs.append(Job(name, source, target))
     return jobs
 
 

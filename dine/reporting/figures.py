@@ -227,13 +227,23 @@ def histogram_figure(
 
 @dataclass(frozen=True)
 class Example:
-    """One test pair for the qualitative figure: per method its registered points and errors."""
+    """One test pair for the qualitative figure.
+
+    Attributes:
+        label: of the row.
+        source: (N, 3).
+        target: (M, 3), without corruption.
+        registered: (N, 3) registered points by method.
+        errors: (N,) of these, as they are to be coloured.
+        seen: (M, 3) the target that methods saw, if it is not the one without corruption.
+    """
 
     label: str
     source: np.ndarray
     target: np.ndarray
     registered: Mapping[str, np.ndarray]
-    squared_distance: Mapping[str, np.ndarray]
+    errors: Mapping[str, np.ndarray]
+    seen: np.ndarray | None = None
 
 
 def pick_examples(
@@ -259,11 +269,7 @@ def pick_examples(
             part = part[part["level"] == part["level"].max()]
         part = part.sort_values(["cd", "pair"], ignore_index=True)
         row = part.iloc[(len(part) - 1) // 2]
-        label = {
-            "deformation": "Clean",
-            "noise": f"Noise σ = {row['corruption']:g}",
-            "outliers": f"{row['corruption']:g} % outliers",
-        }[condition]
+        label = tables.setting_text(condition, row["corruption"])
         if not np.isnan(row["level"]):
             label += f"\nlevel {row['level']:g}"
         picks.append((condition_key(condition, row["corruption"]), str(row["pair"]), label))
@@ -276,7 +282,10 @@ def load_examples(
     predictions: Mapping[str, str | os.PathLike],
     point_errors: Mapping[str, str | os.PathLike],
 ) -> list[Example]:
-    """Gather the clouds of ``pick_examples``; the two mappings give one file per method."""
+    """Gather the clouds of ``pick_examples``; the two mappings give one file per method.
+
+    Errors are squared distances to the clean target, in the unit of the tables.
+    """
     names = np.asarray(pairs.name).astype(str)
     examples = []
     for key, pair, label in picks:
@@ -287,7 +296,7 @@ def load_examples(
             known, displacement = read_group(path, key, "displacement")
             registered[method] = source + displacement[_find(known, pair, path)]
             known, squared = read_group(point_errors[method], key, "squared_distance")
-            errors[method] = squared[_find(known, pair, point_errors[method])]
+            errors[method] = CD_SCALE * squared[_find(known, pair, point_errors[method])]
         examples.append(Example(label, source, np.asarray(pairs.target[index]), registered, errors))
     return examples
 
@@ -299,21 +308,40 @@ def _find(names: np.ndarray, pair: str, where: Any) -> int:
     return int(found[0])
 
 
-def qualitative_figure(examples: Sequence[Example], title: str, origin: str) -> Figure:
+def qualitative_figure(
+    examples: Sequence[Example],
+    title: str,
+    origin: str,
+    *,
+    titles: Mapping[str, str] | None = None,
+    error: str = f"Squared distance to the clean target {_UNIT}",
+    note: str = "Grey: clean target. Median Stage 1 case at the largest level and strongest "
+    "corruption.",
+) -> Figure:
     """3D views: source and target before, then each method's result coloured by point error.
 
     One colour scale for all panels, up to the 98th percentile of the errors shown.
+
+    Args:
+        examples: one row each.
+        title: of the figure.
+        origin: of the data.
+        titles: of the methods, in the order of the columns; by default that of the tables.
+        error: what the colours mean.
+        note: beneath the figure.
     """
-    methods = list(method_styles(examples[0].registered))
-    errors = [CD_SCALE * e for example in examples for e in example.squared_distance.values()]
-    norm = Normalize(0, float(np.percentile(np.concatenate(errors), 98)))
+    known = examples[0].registered
+    titles = titles or {name: display_name(name) for name in method_styles(known)}
+    methods = [name for name in titles if name in known]
+    shown = np.concatenate([e for example in examples for e in example.errors.values()])
+    norm = Normalize(0, float(np.percentile(shown, 98)))
     columns = 1 + len(methods)
     figure = new_figure(
         2.6 * columns + 1,
         2.1 * len(examples) + 0.9,
         title,
         origin,
-        "Grey: clean target. Median Stage 1 case at the largest level and strongest corruption.",
+        note,
     )
     panels = figure.subplots(len(examples), columns, squeeze=False, subplot_kw={"projection": "3d"})
     for row, (example, line) in enumerate(zip(examples, panels, strict=True)):
@@ -322,8 +350,11 @@ def qualitative_figure(examples: Sequence[Example], title: str, origin: str) -> 
         limits = _cube(np.concatenate(view))
         for axes in line:
             _bare_axes(axes, limits)
+        before = example.target if example.seen is None else example.seen
         line[0].scatter(*view[0].T, s=4, color="#E69F00", linewidth=0, label="source")
-        line[0].scatter(*view[1].T, s=4, color="#999999", linewidth=0, label="target")
+        line[0].scatter(
+            *((before - centre) @ rotation).T, s=4, color="#999999", linewidth=0, label="target"
+        )
         line[0].text2D(
             -0.02, 0.5, example.label, rotation=90, va="center", ha="right",
             transform=line[0].transAxes, multialignment="center",
@@ -333,7 +364,7 @@ def qualitative_figure(examples: Sequence[Example], title: str, origin: str) -> 
             axes.scatter(
                 *((example.registered[method] - centre) @ rotation).T,
                 s=6,
-                c=CD_SCALE * example.squared_distance[method],
+                c=example.errors[method],
                 cmap=_ERROR_COLOURS,
                 norm=norm,
                 linewidth=0,
@@ -341,14 +372,14 @@ def qualitative_figure(examples: Sequence[Example], title: str, origin: str) -> 
             )
         if row == 0:
             line[0].legend(fontsize=8, frameon=False, loc="upper left", markerscale=2)
-            for axes, name in zip(line, ["Before", *map(display_name, methods)], strict=True):
+            for axes, name in zip(line, ["Before", *map(titles.get, methods)], strict=True):
                 axes.set_title(name, fontsize=11)
     figure.colorbar(
         ScalarMappable(norm, _ERROR_COLOURS),
         ax=panels,
         shrink=0.6,
         extend="max",
-        label=f"Squared distance to the clean target {_UNIT}",
+        label=error,
     )
     return figure
 

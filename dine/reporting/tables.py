@@ -552,6 +552,15 @@ def display_name(key: str) -> str:
     return {**DATASET_NAMES, **BACKBONE_NAMES, **METHOD_NAMES}.get(key, key)
 
 
+def setting_text(condition: str, corruption: float) -> str:
+    """A condition and its strength, in words."""
+    if condition == "noise":
+        return f"Noise σ = {corruption:g}"
+    if condition == "outliers":
+        return f"{corruption:g} % outliers"
+    return "Clean" if condition == "deformation" else CONDITION_NAMES[condition]
+
+
 def _setting_label(condition: str, corruption: float, level: float) -> tuple[str, str]:
     if condition == "outliers":
         return "Outliers", f"{corruption:g} %"

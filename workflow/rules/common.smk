@@ -13,6 +13,7 @@ from dine.errors import ConfigError
 from dine.provenance import code_digest, folder_signature
 from dine.results import (
     Results,
+    NO_BACKBONE,
     backbone_and_seed,
     conditions,
     evidence_cells,
@@ -62,7 +63,7 @@ EVERY_BACKBONE = "|".join(CONFIG.every_backbone)
 
 
 wildcard_constraints:
-    dataset="|".join(CONFIG.datasets),
+    dataset="|".join([*CONFIG.datasets, *CONFIG.evidence.test_sets]),
     # Trainings with other seeds than the configuration's lie in folders of their own.
     backbone=rf"(?:{EVERY_BACKBONE})(?:/seed\d+)?",
     prior="|".join(CONFIG.priors),
@@ -173,42 +174,62 @@ def calibrating_prior(wildcards):
 # --- evidence: a method's files depend on what the configuration says of it ---
 
 
-def is_synthetic(dataset):
-    return CONFIG.datasets[dataset].source.kind == "synthetic"
+def has_own_pairs(dataset):
+    """Whether the evidence makes pairs of its own; otherwise the dataset's test split is used."""
+    test_sets = CONFIG.evidence.test_sets
+    return dataset in test_sets or CONFIG.datasets[dataset].source.kind == "synthetic"
 
 
 def evidence_raw_settings(wildcards):
-    recipe = CONFIG.datasets[wildcards.dataset].recipe
-    points = CONFIG.datasets[wildcards.dataset].pairs.points
-    recipe = recipe.model_copy(update={"objects": CONFIG.evidence.test_objects})
-    return json.dumps(
-        {"recipe": recipe.model_dump(), "pairs": {"points": points}}, sort_keys=True
-    )
+    test_set = CONFIG.evidence.test_sets.get(wildcards.dataset)
+    dataset = CONFIG.datasets[CONFIG.networks(wildcards.dataset)]
+    settings = {"pairs": {"points": dataset.pairs.points}}
+    if test_set:
+        settings["source"] = {"kind": "path", "folder": test_set.folder}
+    else:
+        changes = {"objects": CONFIG.evidence.test_objects}
+        settings["recipe"] = dataset.recipe.model_copy(update=changes).model_dump()
+    return json.dumps(settings, sort_keys=True)
+
+
+def evidence_raw_signature(wildcards):
+    test_set = CONFIG.evidence.test_sets.get(wildcards.dataset)
+    return folder_signature(Path(test_set.folder).expanduser()) if test_set else ""
+
+
+def evidence_pair_settings(wildcards):
+    return section(CONFIG.datasets[CONFIG.networks(wildcards.dataset)].pairs)
 
 
 def evidence_raw_file(wildcards):
-    if is_synthetic(wildcards.dataset):
+    if has_own_pairs(wildcards.dataset):
         return FILES.evidence(wildcards.dataset, "raw.json")
     return FILES.dataset(wildcards.dataset, "raw.json")
 
 
 def evidence_pairs_file(wildcards):
-    """Objects of their own where data are synthetic, otherwise the dataset's test split."""
-    if is_synthetic(wildcards.dataset):
+    if has_own_pairs(wildcards.dataset):
         return FILES.evidence(wildcards.dataset, "pairs.h5")
     return FILES.dataset(wildcards.dataset, "pairs.h5")
+
+
+def evidence_levels(wildcards):
+    if wildcards.dataset in CONFIG.evidence.test_sets:
+        return ""
+    return options("--at", CONFIG.evidence.at_levels)
 
 
 def evidence_variants(wildcards):
     return [
         FILES.evidence(wildcards.dataset, "variants", f"{condition}_{level:g}.h5")
-        for condition, level in evidence_conditions(CONFIG)
+        for condition, level in evidence_conditions(CONFIG, wildcards.dataset)
     ]
 
 
 def evidence_model(wildcards):
     folder = replica(CONFIG, wildcards.cell_backbone, int(wildcards.seed))
-    return FILES.run(wildcards.dataset, folder, wildcards.network, "model.safetensors")
+    trained_on = CONFIG.networks(wildcards.dataset)
+    return FILES.run(trained_on, folder, wildcards.network, "model.safetensors")
 
 
 def searched_prior(wildcards):
@@ -265,7 +286,8 @@ def refined_inputs(wildcards):
     }
     if method.prior:
         folder = replica(CONFIG, wildcards.cell_backbone, int(wildcards.seed))
-        found["prior"] = FILES.prior(wildcards.dataset, folder, method.prior)
+        fitted_on = CONFIG.networks(wildcards.dataset)
+        found["prior"] = FILES.prior(fitted_on, folder, method.prior)
     return found
 
 
@@ -282,7 +304,7 @@ def group_cells(wildcards):
     return [cell for cell in evidence_cells(CONFIG) if cell[:3] == group]
 
 
-def group_predictions(wildcards):
+def cell_predictions(cells):
     return [
         FILES.evidence(
             cell.dataset,
@@ -291,15 +313,38 @@ def group_predictions(wildcards):
             cell.method,
             "predictions.h5",
         )
-        for cell in group_cells(wildcards)
+        for cell in cells
     ]
 
 
-def group_options(wildcards, input):
-    methods = [cell.method for cell in group_cells(wildcards)]
-    return (
-        f"{options('--method', methods)} {options('--predictions', input.predictions)}"
-    )
+def cell_options(cells, predictions):
+    methods = [cell.method for cell in cells]
+    return f"{options('--method', methods)} {options('--predictions', predictions)}"
+
+
+def example_cells(wildcards):
+    """What is drawn of a dataset: with the backbone of the search and the first seed."""
+    place = (CONFIG.lambda_search.backbone, CONFIG.evidence.seeds[0])
+    found = {
+        cell.method: cell
+        for cell in evidence_cells(CONFIG)
+        if cell.dataset == wildcards.dataset
+        and (cell.backbone, cell.seed) in {place, (NO_BACKBONE, 0)}
+    }
+    return [found[name] for name in CONFIG.evidence.examples if name in found]
+
+
+def evidence_examples():
+    datasets = dict.fromkeys(cell.dataset for cell in evidence_cells(CONFIG))
+    return [FILES.evidence(dataset, "examples.png") for dataset in datasets]
+
+
+def evidence_example_options(wildcards, input):
+    rows = [
+        (Path(path).parent.name, path, "typical pairs under each condition.")
+        for path in input.examples
+    ]
+    return options("--example", *zip(*rows)) if rows else ""
 
 
 def evidence_metrics():

@@ -33,6 +33,7 @@ rule evidence_raw:
         "../envs/dine.yaml"
     params:
         settings=evidence_raw_settings,
+        signature=evidence_raw_signature,
         first=FIRST_TEST_OBJECT,
         seed=CONFIG.seed,
         code=code_digest("raw"),
@@ -51,7 +52,7 @@ rule evidence_pairs:
     conda:
         "../envs/dine.yaml"
     params:
-        settings=lambda wildcards: section(CONFIG.datasets[wildcards.dataset].pairs),
+        settings=evidence_pair_settings,
         seed=CONFIG.seed,
         code=code_digest("pairs"),
     shell:
@@ -71,7 +72,7 @@ rule evidence_corrupt:
     conda:
         "../envs/dine.yaml"
     params:
-        levels=options("--at", CONFIG.evidence.at_levels),
+        levels=evidence_levels,
         seed=CONFIG.seed,
         code=code_digest("corrupt"),
     shell:
@@ -90,7 +91,7 @@ rule evidence_resample:
     conda:
         "../envs/dine.yaml"
     params:
-        levels=options("--at", CONFIG.evidence.at_levels),
+        levels=evidence_levels,
         seed=CONFIG.seed,
         code=code_digest("pairs"),
     shell:
@@ -259,7 +260,7 @@ rule evidence_classical:
 # One job for all methods of a network and seed, as starting a job takes longer than its share.
 rule evidence_evaluate:
     input:
-        predictions=group_predictions,
+        predictions=lambda wildcards: cell_predictions(group_cells(wildcards)),
         pairs=evidence_pairs_file,
         variants=evidence_variants,
     output:
@@ -272,7 +273,9 @@ rule evidence_evaluate:
         "../envs/dine.yaml"
     params:
         variants=variant_options,
-        runs=group_options,
+        runs=lambda wildcards, input: cell_options(
+            group_cells(wildcards), input.predictions
+        ),
         code=code_digest("evaluation"),
     shell:
         "dine --log {log:q} evaluate {params.runs} --pairs {input.pairs:q}"
@@ -302,8 +305,33 @@ rule evidence_diagnose:
         " --name {wildcards.prior} --seed {params.seed} --out {output.result:q}"
 
 
+rule evidence_examples:
+    input:
+        predictions=lambda wildcards: cell_predictions(example_cells(wildcards)),
+        pairs=evidence_pairs_file,
+        variants=evidence_variants,
+    output:
+        views=EVIDENCE / "{dataset}" / "examples.png",
+        print=EVIDENCE / "{dataset}" / "examples.pdf",
+    log:
+        EVIDENCE_LOGS / "{dataset}" / "examples.log",
+    conda:
+        "../envs/dine.yaml"
+    params:
+        variants=variant_options,
+        runs=lambda wildcards, input: cell_options(
+            example_cells(wildcards), input.predictions
+        ),
+        methods=evidence_method_texts(),
+        code=code_digest("reporting"),
+    shell:
+        "dine --log {log:q} examples {params.runs} --pairs {input.pairs:q} {params.variants}"
+        " --methods {params.methods:q} --dataset {wildcards.dataset} --out {output.views:q}"
+
+
 rule evidence:
     input:
+        examples=evidence_examples(),
         metrics=evidence_metrics(),
         searches=evidence_searches(),
         diagnostics=evidence_diagnostics(),
@@ -320,10 +348,12 @@ rule evidence:
     params:
         searches=lambda wildcards, input: options("--search", input.searches),
         diagnostics=lambda wildcards, input: options("--diagnostics", input.diagnostics),
+        examples=evidence_example_options,
         methods=evidence_method_texts(),
         settings=section(CONFIG),
         code=code_digest("reporting", "evaluation"),
     shell:
         "dine --log {log:q} evidence {input.metrics:q} {params.searches} {params.diagnostics}"
+        " {params.examples}"
         " --methods {params.methods:q} --settings {params.settings:q}"
         ' --out "$(dirname {output:q})"'

@@ -6,6 +6,7 @@ place of their datasets.
 """
 
 from dine.reporting.evidence.comparisons import Evidence, load_evidence
+from dine.reporting.evidence.examples import draw_examples
 from dine.reporting.evidence.report import Picture, build_evidence
 
-__all__ = ["Evidence", "Picture", "build_evidence", "load_evidence"]
+__all__ = ["Evidence", "Picture", "build_evidence", "draw_examples", "load_evidence"]

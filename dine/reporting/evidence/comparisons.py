@@ -145,8 +145,8 @@ class Evidence:
         metrics: as ``load_evidence`` returns them.
         methods: title, group and description by method; see ``build_evidence``.
         reference: what all methods are compared with.
-        aside: backbones that are shown, but neither count for the goal nor for the order of
-            methods.
+        aside: backbones and datasets that are shown, but neither count for the goal nor for the
+            order of methods.
 
     Raises:
         DataError: the reference is missing, nothing can be compared with it, or a group is unknown.
@@ -170,8 +170,9 @@ class Evidence:
             )
         self.large_rows = self.clean[self.clean["level"] >= LARGE]
         self.places = self._places()
-        # Few methods are tried with such backbones, so they would decide which can win at all.
-        self.judged = [place for place in self.places if place[1] not in aside] or self.places
+        # Few methods are tried with such backbones, so they would decide which can win at all; and
+        # such datasets are too small to.
+        self.judged = [p for p in self.places if not set(p) & set(aside)] or self.places
         if self.comparisons.empty:
             raise DataError(f"The metrics hold no method to compare with {reference!r}.")
 
@@ -272,6 +273,11 @@ class Evidence:
         """``comparisons`` on clean targets, one row per place, method, level and value."""
         table = self.comparisons
         return table[(table["condition"] == CLEAN) & table["level"].notna()]
+
+    @functools.cached_property
+    def judged_cells(self) -> pd.DataFrame:
+        """Those of the places that count."""
+        return pd.concat([at(self.cells, place) for place in self.judged])
 
     def overall(self, place: tuple[str, str]) -> pd.DataFrame:
         """``comparisons`` on clean targets of all levels together at a place."""

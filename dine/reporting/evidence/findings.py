@@ -42,7 +42,8 @@ def all_findings(evidence: Evidence) -> list[Finding]:
 def _paper_prior(evidence: Evidence) -> Finding | None:
     if evidence.reference == PAPER_PRIOR:
         return None
-    cells = evidence.cells[evidence.cells["method"] == PAPER_PRIOR]
+    cells = evidence.judged_cells
+    cells = cells[cells["method"] == PAPER_PRIOR]
     if cells.empty:
         return Finding(
             f"The paper's prior ({PAPER_PRIOR}) was not evaluated on the same targets as "
@@ -176,11 +177,12 @@ def _goal(evidence: Evidence) -> list[Finding]:
         )
         shown = [closest]
     if len(evidence.judged) < len(evidence.places):
-        judged = {backbone for _, backbone in evidence.judged}
-        aside = sorted({backbone for _, backbone in evidence.places} - judged)
+        judged = {name for place in evidence.judged for name in place}
+        others = (place for place in evidence.places if place not in evidence.judged)
+        aside = dict.fromkeys(name for place in others for name in place if name not in judged)
         text += (
-            f" {join([display_name(name) for name in aside])}, with which few methods were tried, "
-            "do not count here or in the order of methods."
+            f" {join([display_name(name) for name in aside])}, with few methods or pairs, "
+            f"{'do' if len(aside) > 1 else 'does'} not count here or in the order of methods."
         )
     return [Finding(text), *_against_classical(evidence, shown)]
 
@@ -236,7 +238,7 @@ def _against_classical(evidence: Evidence, methods: Sequence[str]) -> list[Findi
 
 
 def _no_help(evidence: Evidence) -> Finding:
-    verdict = evidence.cells.groupby("method")["verdict"].agg(set)
+    verdict = evidence.judged_cells.groupby("method")["verdict"].agg(set)
     treated = [
         n for n in evidence.candidates if evidence.methods[n].group != "network" and n in verdict
     ]

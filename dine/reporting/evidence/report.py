@@ -281,13 +281,15 @@ def build_evidence(
         diagnostics: what ``diagnose`` found, with ``dataset``, ``backbone`` and ``prior``; a PNG of
             the same name beside is shown as the prior's samples.
         examples: further pictures.
-        config: the resolved configuration; the backbones under its ``evidence`` are set aside.
+        config: the resolved configuration; the backbones and test sets under its ``evidence`` are
+            set aside.
 
     Raises:
         DataError: a file cannot be used, see ``load_evidence``, or is of a dataset that the
             metrics do not have; or methods were evaluated on pairs that do not meet.
     """
-    aside = ((config or {}).get("evidence") or {}).get("backbones") or {}
+    settings = (config or {}).get("evidence") or {}
+    aside = [*(settings.get("backbones") or {}), *(settings.get("test_sets") or {})]
     evidence = Evidence(load_evidence(metrics), methods, reference, tuple(aside))
     known = set(evidence.datasets)
     found = [_read(path, ("dataset", "backbone", "curve"), known) for path in searches]

@@ -27,7 +27,7 @@ from dine.reporting.evidence.wording import (
     signed,
     slug,
 )
-from dine.reporting.tables import CONDITION_NAMES, Cell, Table, display_name
+from dine.reporting.tables import Cell, Table, display_name, setting_text
 from dine.results import CLEAN
 
 _NAMES = (("", "Kind"), ("", "Method"))
@@ -254,7 +254,7 @@ def corruption_table(evidence: Evidence, place: tuple[str, str], value: str) -> 
         levels = data.loc[
             (data["condition"] == setting[0]) & (data["corruption"] == setting[1]), "levels"
         ].iloc[0]
-        group = f"{_setting(*setting)} (level {levels.replace(' ', ', ')})"
+        group = f"{setting_text(*setting)} (level {levels.replace(' ', ', ')})"
         header += [(group, name), (group, "% to clean")]
     unit = " in units of 10⁻⁴" if scale != 1 else ""
     return Table(
@@ -269,14 +269,6 @@ def corruption_table(evidence: Evidence, place: tuple[str, str], value: str) -> 
         rows=tuple(rows),
         data=data,
     )
-
-
-def _setting(condition: str, corruption: float) -> str:
-    if condition == "noise":
-        return f"Noise σ = {corruption:g}"
-    if condition == "outliers":
-        return f"{corruption:g} % outliers"
-    return CONDITION_NAMES[condition]
 
 
 def seed_table(evidence: Evidence) -> Table | None:
