@@ -925,7 +925,7 @@ def register_many(
 def calibrate(model, pairs, targets, prior, device, out):
     """Learn from validation pairs what a model's uncertainty means; check it on test pairs.
 
-    Example: dine calibrate --model model.safetensors --pairs pairs.h5 --prior
+    Example: dine calibrate --model model.safetensors --pairs pairs.h5 --targets resampled.h5 --prior
     pca.safetensors --out calibration.json
     """
     from dine.registration.calibration import calibrate as run

@@ -50,7 +50,9 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "calibration": (
         "evaluation/quality.py",
         "registration/calibration.py",
+        "registration/expectation.py",
         "registration/refine.py",
+        "registration/shared_points.py",
     ),
     "registration": ("registration", "evaluation/quality.py"),
 }

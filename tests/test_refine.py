@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.distance import cdist
 
 from dine.models.checkpoint import load_backbone
 from dine.priors.gaussian import LinearGaussian, squared_exponential
-from dine.registration import refine as module
 from dine.registration.calibration import find_field
+from dine.registration.expectation import Matches, Model
 from dine.registration.refine import LOOSE, STIFF, expected_error, refine
+from dine.registration.shared_points import SharedPoints
 from dine.training.stages import shipped_weights
 
 
@@ -61,7 +63,7 @@ def test_the_solve_is_the_posterior_mean(modes, rank):
         rng.normal(size=(12, 3)), rng.normal(size=(modes, 12, 3)), rng.normal(size=(12, rank))
     )
     value, precision = rng.normal(size=(12, 3)), rng.uniform(0.1, 5, size=12)
-    model = module._Model(rng.normal(size=(12, 3)), rng.normal(size=(7, 3)), prior, 0.01, 0)
+    model = Model(rng.normal(size=(12, 3)), rng.normal(size=(7, 3)), prior, 0.01, 0)
     field, energy = model.most_probable(value, precision)
     np.testing.assert_allclose(field, dense(prior, value, precision), atol=1e-9)
     # Half the squared Mahalanobis length of what the field is made of.
@@ -90,7 +92,7 @@ def test_without_rounds_it_is_the_mean_of_the_stiff_process():
 def test_one_round_follows_the_formula(pair):
     source, target, _ = pair
     prior = STIFF.at(source)
-    model = module._Model(source, target, prior, STIFF.least, 0)
+    model = Model(source, target, prior, STIFF.least, 0)
     found = model.rounds(np.zeros_like(source), 1, variance=0.02)[1].field
     squared = ((source[:, None] - target[None]) ** 2).sum(axis=2)
     density = (1 - 0.1) / len(source) * np.exp(-squared / 0.04) / (2 * np.pi * 0.02) ** 1.5
@@ -102,7 +104,7 @@ def test_one_round_follows_the_formula(pair):
 
 def test_every_field_becomes_more_probable(pair):
     source, target, _ = pair
-    model = module._Model(source, target, STIFF.at(source), STIFF.least, 0)
+    model = Model(source, target, STIFF.at(source), STIFF.least, 0)
     found = [
         model.rounds(np.zeros_like(source), rounds)[1].improbability for rounds in (1, 5, 20, 40)
     ]
@@ -125,18 +127,79 @@ def test_a_network_that_is_wrong_as_a_whole_does_no_harm(pair):
     assert error(refine(source, target, wrong, sure), truth) <= error(alone, truth) + 1e-6
 
 
-def test_shared_points_are_met(pair):
+def test_what_is_matched_is_held_and_its_targets_are_taken(pair):
+    """Half of the points matched: the others find theirs, but not where these have settled."""
     source, target, truth = pair
-    assert error(refine(source, target, None, None), truth) < 2e-3
+    nearest = cdist(source + truth, target).argmin(axis=1)
+    known = source[:, 0] > 0
+    model = Model(source, target, LOOSE.at(source), 0.002, 0, Matches(known, nearest))
+    assert model.free == np.count_nonzero(~known)
+    start = model.from_matches()
+    assert error(start[known], truth[known]) < 1e-3
+    assert error(start[~known], truth[~known]) < error(np.zeros_like(truth[~known]), truth[~known])
+    found = model.rounds(start, 30)[1].field
+    assert error(found[known], truth[known]) < 1e-3
+    assert error(found[~known], truth[~known]) < 0.3 * error(start[~known], truth[~known])
+    # With everything that is free held to be matched as well, nothing is left to look for.
+    assert (
+        Model(source, target, LOOSE.at(source), 0.002, 0, Matches(known | True, nearest)).free == 0
+    )
 
 
-def test_points_of_their_own_are_not_followed(pair, monkeypatch):
+# --- points that both clouds hold -----------------------------------------------------------------
+
+
+def test_shared_points_are_met_exactly(pair):
+    source, target, truth = pair
+    assert np.abs(refine(source, target, None, None) - truth).max() < 1e-12
+
+
+def test_matching_goes_on_from_what_is_right_somewhere(pair):
+    """A field that is right at a third of the points only."""
+    source, target, truth = pair
+    wrong = truth + np.where(source[:, :1] > 0.3, 0.0, 0.3)
+    shared = SharedPoints(source, target)
+    known = shared.matches(wrong).known
+    assert 0.1 < known.mean() < 0.5
+    assert error(wrong[known], truth[known]) < 1e-12
+    found, share = shared.grow(wrong, LOOSE.at(source))
+    assert share > 0.99
+    assert error(found, truth) < 1e-3
+
+
+def test_matches_are_mutual_close_and_like_their_neighbours():
+    source = organ(200, 7)
+    far = np.zeros_like(source)
+    far[0] = 5.0  # one stray target: its source point has no match, whoever is nearest
+    shared = SharedPoints(source, source + far)
+    found = shared.matches(np.zeros_like(source))
+    assert found.known.tolist() == [False] + [True] * 199
+    assert found.target[1:].tolist() == list(range(1, 200))
+    # A single point that happens to lie right, among others that do not.
+    alone = np.full_like(source, 0.02)
+    alone[5] = 0.0
+    assert not shared.matches(alone).known[5]
+    # Two source points on one target.
+    twice = np.zeros_like(source)
+    twice[10] = source[11] - source[10]
+    assert shared.matches(twice).known[[10, 11]].sum() <= 1
+
+
+def test_independent_samples_are_not_matched(pair):
+    source, _, truth = pair
+    other = organ(420, 9)
+    shared = SharedPoints(source, other + bent(other))
+    found, share = shared.grow(truth, LOOSE.at(source))
+    assert share == 0
+    np.testing.assert_array_equal(found, truth)
+
+
+def test_points_of_their_own_are_not_followed(pair):
     source, _, truth = pair
     other = organ(420, 9)
     target = other + bent(other)
     found = refine(source, target, None, None)
-    monkeypatch.setattr(module, "_SAME", np.inf)
-    loose = refine(source, target, None, None)
+    loose = refine(source, target, None, None, prior=LOOSE.at(source))
     assert error(found, truth) < error(loose, truth)
     # An ellipsoid hardly shows where along it a point went.
     assert error(found, truth) < 0.8 * np.linalg.norm(truth, axis=1).mean()
@@ -146,7 +209,7 @@ def test_outliers_are_ignored(pair):
     source, target, truth = pair
     strange = np.random.default_rng(3).uniform(-1, 1, size=(100, 3))
     found = refine(source, np.concatenate([target, strange]), None, None)
-    assert error(found, truth) < 0.01
+    assert error(found, truth) < 1e-3
 
 
 def test_the_order_of_the_target_does_not_matter_and_nothing_is_random(pair):
@@ -173,9 +236,10 @@ def test_a_part_looks_for_the_whole(pair):
     assert error(found, truth[shown]) < 0.5 * np.linalg.norm(truth[shown], axis=1).mean()
 
 
-def test_few_points():
-    source = organ(3, 5)
-    assert np.isfinite(refine(source, source[:1] + 0.1, None, None)).all()
+@pytest.mark.parametrize(("points", "targets"), [(3, 1), (1, 3), (1, 1), (8, 8), (9, 9)])
+def test_few_points(points, targets):
+    source = organ(points, 5)
+    assert np.isfinite(refine(source, organ(targets, 6) + 0.1, None, None)).all()
 
 
 def test_expected_error():

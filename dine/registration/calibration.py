@@ -22,6 +22,7 @@ from dine.registration.refine import ROUNDS, expected_error, refine
 
 CALIBRATION_FORMAT = "dine-calibration"
 _BINS = 20
+_EXACT = 1e-9  # object radii
 _LIKELY = 90
 
 
@@ -182,7 +183,8 @@ def calibrate(
     ``targets`` are variants of all pairs of each file, such as resampled ones, to register to.
 
     Raises:
-        DataError: a split has no pairs.
+        DataError: a split has no pairs, or source and target share their points: refinement then
+            matches them exactly, which says nothing of two scans.
     """
     from scipy.stats import spearmanr
     from sklearn.isotonic import IsotonicRegression
@@ -196,6 +198,11 @@ def calibrate(
             raise DataError(f"There are no {split} pairs to calibrate with.")
         measured[split] = _measure(backbone, fitted, pairs, seen, device, f"calibration, {split}")
     spread, error, reference = measured["val"]
+    if np.median(error) < _EXACT:
+        raise DataError(
+            "Sources and targets hold the same points, which are matched exactly, so there are no "
+            "errors to learn from; give targets of other points (`dine resample`, `--targets`)."
+        )
     edges = np.unique(np.quantile(spread, np.linspace(0, 1, _BINS + 1)))
     if len(edges) < 3:
         raise DataError("All points moved alike; there is nothing to learn errors from.")

@@ -1,0 +1,86 @@
+"""Where both clouds hold the same points: matching them one to one, from what is sure outwards.
+
+A field that is right somewhere puts source points right onto their targets there. Such points are
+matched: they and a target are each other's nearest, close to each other, and most of their
+neighbours are matched as well. The prior, given all matches, says where their neighbours go, which
+brings these close enough to be matched next. Where this ends, a few rounds of
+expectation–maximisation among the points that are left find where it can go on, with what is
+matched held fixed and its targets taken.
+
+In scans that were sampled independently nearly no point is matched by chance (up to 0.6 % on
+resampled validation pairs, 10 % with noise of a hundredth of the radius), which is how such pairs
+are told apart.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dine.priors.gaussian import LinearGaussian
+from dine.registration.expectation import Matches, Model
+
+# Chosen on the validation pairs of both synthetic datasets (60) and of the pretraining (90).
+_CLOSE = 0.3  # spacings of the target
+_NEIGHBOURS = 8
+_AGREEING = 0.5
+_LEAST = 0.002
+_SHARED = 0.1
+_ROUNDS = 15
+_ATTEMPTS = 6
+
+
+class SharedPoints:
+    """Looks for matches of a source (N, 3) and a target (M, 3)."""
+
+    def __init__(self, source: np.ndarray, target: np.ndarray):
+        self.source, self.target = source, target
+        self._few = min(len(source), len(target)) <= _NEIGHBOURS
+        if not self._few:
+            self._tree = cKDTree(target)
+            self._spacing = np.median(self._tree.query(target, k=2)[0][:, 1])
+            self._neighbours = cKDTree(source).query(source, k=_NEIGHBOURS + 1)[1][:, 1:]
+
+    def matches(self, field: np.ndarray) -> Matches:
+        """What is matched once the field (N, 3) has moved the source."""
+        moved = self.source + field
+        distance, nearest = self._tree.query(moved)
+        back = cKDTree(moved).query(self.target)[1]
+        mutual = back[nearest] == np.arange(len(moved))
+        close = mutual & (distance < _CLOSE * self._spacing)
+        return Matches(close & (close[self._neighbours].mean(axis=1) >= _AGREEING), nearest)
+
+    def grow(self, field: np.ndarray, prior: LinearGaussian) -> tuple[np.ndarray, float]:
+        """A field (N, 3) that puts every matched point onto its target, and the share matched.
+
+        Starts from what ``field`` (N, 3) matches; where that is too little for clouds that hold the
+        same points, or these are too few, the field comes back as it is, with a share of zero.
+        """
+        if self._few:
+            return field, 0.0
+        found = self.matches(field)
+        if found.known.mean() < _SHARED:
+            return field, 0.0
+        for _ in range(_ATTEMPTS):
+            field, found = self._spread(field, found, prior)
+            left = Model(self.source, self.target, prior, _LEAST, 0, found)
+            if left.free < 3:
+                break
+            searched = left.rounds(left.from_matches(), _ROUNDS)[1].field
+            more = self.matches(searched)
+            if more.known.sum() <= found.known.sum():
+                break
+            field, found = searched, more
+        exact = found.displacement(self.source, self.target)
+        return np.where(found.known[:, None], exact, field), float(found.known.mean())
+
+    def _spread(
+        self, field: np.ndarray, found: Matches, prior: LinearGaussian
+    ) -> tuple[np.ndarray, Matches]:
+        """Field and matches once the matches alone lead to no more."""
+        while True:
+            further = Model(self.source, self.target, prior, _LEAST, 0, found).from_matches()
+            more = self.matches(further)
+            if more.known.sum() <= found.known.sum():
+                return field, found
+            field, found = further, more
