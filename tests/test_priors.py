@@ -452,15 +452,19 @@ def test_pca_process_is_the_dense_gaussian():
 
 def test_pca_process_integrates_masked_points_out():
     prior = pca_process()
-    new, mean, covariance = rough_fields(2, seed=1), prior.mean.numpy(), dense_sum(prior, cloud())
-    mask = torch.ones(2, POINTS, dtype=torch.bool)
+    points = cloud()
+    points[1] = points[0]
+    new, mean, covariance = rough_fields(3, seed=1), prior.mean.numpy(), dense_sum(prior, points)
+    mask = torch.ones(3, POINTS, dtype=torch.bool)
     mask[0, ::3] = False
-    mask[1, 5] = False
+    # The same points are left, but not the same components of them.
+    mask[1, 0] = False
+    mask[2, 1] = False
     tensor = torch.from_numpy(new)
     tensor[~mask] = 100.0
-    # Each mask has its own factors, although the source is one.
+    source = torch.from_numpy(points)[None].expand(3, -1, -1)
     for _ in range(2):
-        found = prior.penalty(tensor, mask, batch(2))
+        found = prior.penalty(tensor, mask, source)
         for field, valid, value in zip(new, mask.numpy(), found, strict=True):
             rows = np.repeat(valid, 3)
             deviation = field.ravel()[rows] - mean[rows]
