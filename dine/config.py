@@ -212,6 +212,11 @@ class SmoothnessArguments(Section):
     """Share of the magnitude in the penalty, besides the roughness; makes the density proper."""
 
 
+class PCAProcessArguments(GaussianProcessArguments, PCAArguments):
+    folds: Annotated[Count, Field(ge=2)] = 5
+    """Folds of the cross-validation that gives the fields of the residual process."""
+
+
 class LatentFlowArguments(PCAResidualArguments):
     transforms: Count = 4
     """RealNVP coupling layers."""
@@ -560,6 +565,7 @@ PRIOR_ARGUMENTS: dict[str, type[Section]] = {
     "pca": PCAArguments,
     "flow": FlowArguments,
     "pca_residual": PCAResidualArguments,
+    "pca_process": PCAProcessArguments,
     "gaussian_process": GaussianProcessArguments,
     "smoothness": SmoothnessArguments,
     "latent_flow": LatentFlowArguments,

@@ -16,9 +16,10 @@ QUICK = {
     "flow": {"steps": 5, "hidden": 8, "transforms": 2},
     "latent_flow": {"components": 6, "steps": 30, "hidden": 8, "transforms": 2},
     "gaussian_process": {"widths": [0.5, 1.0]},
+    "pca_process": {"components": 6, "widths": [0.5, 1.0]},
 }
-FIELD = {"pca_residual", "latent_flow", "gaussian_process", "smoothness", "flow"}
-SPAN = {"pca", "pca_residual", "latent_flow"}
+FIELD = {"pca_residual", "pca_process", "latent_flow", "gaussian_process", "smoothness", "flow"}
+SPAN = {"pca", "pca_residual", "pca_process", "latent_flow"}
 
 
 @pytest.fixture(scope="module")

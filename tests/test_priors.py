@@ -22,9 +22,11 @@ QUICK = {
     "flow": {"steps": 60, "hidden": 16, "transforms": 3},
     "latent_flow": {"components": 6, "steps": 30, "hidden": 8, "transforms": 2},
     "gaussian_process": {"widths": [0.5, 1.0]},
+    "pca_process": {"components": 6, "widths": [0.5, 1.0]},
 }
 CONDITIONAL = [name for name in PRIORS.names() if PRIORS.get(name).conditional]
-GAUSSIAN = ["gaussian_process", "pca", "pca_residual", "smoothness"]
+ANY_POINTS = [name for name in CONDITIONAL if name != "pca_process"]
+GAUSSIAN = ["gaussian_process", "pca", "pca_process", "pca_residual", "smoothness"]
 
 
 def cloud(points=POINTS, seed=42):
@@ -166,7 +168,7 @@ def test_conditional_priors_ask_for_the_source(name):
         prior.sample(2, source=batch(1))
 
 
-@pytest.mark.parametrize("name", CONDITIONAL)
+@pytest.mark.parametrize("name", ANY_POINTS)
 def test_conditional_priors_take_any_points_in_any_order(name):
     prior = fitted(name).double()
     rng = np.random.default_rng(0)
@@ -206,8 +208,9 @@ def test_linear_gaussian_models_have_the_covariance_of_the_samples(name):
     modes = model.modes.reshape(-1, 3 * POINTS)
     kernel = np.kron(model.kernel @ model.kernel.T, np.eye(3))
     covariance = modes.T @ modes + kernel
-    if name == "gaussian_process":  # its smooth part, without the noise of the samples
-        covariance += prior.noise.item() ** 2 * np.eye(3 * POINTS)
+    if "process" in name:  # its smooth part, without the noise of the samples
+        noise = getattr(prior, "process", prior).noise.item()
+        covariance += noise**2 * np.eye(3 * POINTS)
     samples = prior.sample(20000, torch.Generator().manual_seed(1), batch(1)[0]).flatten(1).numpy()
     if name == "pca_residual":  # its span
         outside = prior.normalised(torch.from_numpy(samples).view(-1, POINTS, 3)).numpy()
@@ -401,6 +404,166 @@ def test_the_least_noise_is_kept_to():
     fit = PRIORS.get("gaussian_process").fit
     assert fit(fields, source=sources(10)).noise.item() == pytest.approx(1e-3)
     assert fit(fields, source=sources(10), least_noise=0.02).noise.item() == pytest.approx(0.02)
+
+
+def rough_fields(count, seed=0):
+    """Three modes, equally strong at all coordinates, and a smooth process with noise."""
+    process = gaussian_process((0.02, 0.0), affine=0.0, noise=0.005)
+    strength = np.random.default_rng(seed).normal(size=(count, 3))
+    modes = np.random.default_rng(42).choice([-1, 1], size=(3, POINTS, 3))
+    generator = torch.Generator().manual_seed(seed)
+    rough = process.sample(count, generator, torch.from_numpy(cloud())).numpy()
+    return 0.1 * np.einsum("km,mnd->knd", strength, modes) + rough
+
+
+def pca_process(count=60, **arguments):
+    arguments = {"components": 3, "widths": [0.4, 1.0], "least_noise": 5e-3, **arguments}
+    fit = PRIORS.get("pca_process").fit
+    return fit(rough_fields(count), source=sources(count), **arguments).double()
+
+
+def dense_sum(prior, points, noise=True):
+    """Covariance of all 3N coordinates by the formula, with the coordinates of a point adjacent."""
+    scale, basis = prior.scale.numpy(), prior.basis.numpy()
+    span = scale[:, None] * (basis.T @ prior.covariance.numpy() @ basis) * scale
+    kernel = dense_kernel(prior.process, points)
+    if noise:
+        kernel = kernel + prior.process.noise.item() ** 2 * np.eye(len(points))
+    return span + np.kron(kernel, np.eye(3))
+
+
+def test_pca_process_is_the_dense_gaussian():
+    prior = pca_process()
+    new, points = rough_fields(6, seed=1), cloud()
+    mean, covariance = prior.mean.numpy(), dense_sum(prior, points)
+    tensor, source = torch.from_numpy(new), batch(6)
+    expected = multivariate_normal(mean, covariance).logpdf(new.reshape(6, -1))
+    assert np.allclose(prior.log_prob(tensor, source), expected, rtol=1e-5)
+    deviation = new.reshape(6, -1) - mean
+    energy = np.einsum("ki,ij,kj->k", deviation, np.linalg.inv(covariance), deviation)
+    assert np.allclose(prior.penalty(tensor, None, source), energy, rtol=1e-4)
+    smooth = dense_sum(prior, points, noise=False) @ np.linalg.solve(covariance, deviation.T)
+    found = prior.smoothed(tensor, source).flatten(1).numpy()
+    assert np.allclose(found, mean + smooth.T, atol=1e-4)
+    # In float32, too, although the components are far stronger than the noise.
+    single = prior.float().penalty(tensor.float(), None, source.float())
+    assert np.allclose(single, energy, rtol=1e-3)
+
+
+def test_pca_process_integrates_masked_points_out():
+    prior = pca_process()
+    points = cloud()
+    points[1] = points[0]
+    new, mean, covariance = rough_fields(3, seed=1), prior.mean.numpy(), dense_sum(prior, points)
+    mask = torch.ones(3, POINTS, dtype=torch.bool)
+    mask[0, ::3] = False
+    # The same points are left, but not the same components of them.
+    mask[1, 0] = False
+    mask[2, 1] = False
+    tensor = torch.from_numpy(new)
+    tensor[~mask] = 100.0
+    source = torch.from_numpy(points)[None].expand(3, -1, -1)
+    for _ in range(2):
+        found = prior.penalty(tensor, mask, source)
+        for field, valid, value in zip(new, mask.numpy(), found, strict=True):
+            rows = np.repeat(valid, 3)
+            deviation = field.ravel()[rows] - mean[rows]
+            part = covariance[np.ix_(rows, rows)]
+            assert math.isclose(value, deviation @ np.linalg.solve(part, deviation), rel_tol=1e-4)
+
+
+def test_pca_process_as_modes_and_kernel_has_the_same_covariance():
+    prior = pca_process()
+    model = prior.gaussian(cloud())
+    modes = model.modes.reshape(3, -1)
+    found = modes.T @ modes + np.kron(model.kernel @ model.kernel.T, np.eye(3))
+    expected = dense_sum(prior, cloud(), noise=False)
+    assert np.allclose(found, expected, atol=1e-3 * expected.max())
+    assert np.allclose(model.mean.ravel(), prior.mean.numpy())
+    with pytest.raises(DataError, match="source of 21"):
+        prior.gaussian(cloud(POINTS + 1))
+
+
+def test_pca_process_without_components_is_the_process():
+    prior = pca_process()
+    prior.mean.zero_()
+    prior.scale.zero_()
+    fields, source = torch.from_numpy(rough_fields(3, seed=2)), batch(3)
+    process = prior.process
+    assert torch.allclose(
+        prior.penalty(fields, None, source), process.penalty(fields, None, source)
+    )
+    assert torch.allclose(prior.log_prob(fields, source), process.log_prob(fields, source))
+    assert torch.allclose(prior.smoothed(fields, source), process.smoothed(fields, source))
+    drawn = prior.sample(3, torch.Generator().manual_seed(0), source[0])
+    assert np.abs(drawn).max() > 0
+
+
+def test_pca_process_learns_what_components_miss():
+    many = pca_process(count=200)
+    notes = many.notes["process"]
+    assert np.hypot(*notes["amplitudes"]) == pytest.approx(0.02, rel=0.1)
+    # The three rough modes take their share of 60 directions from the smooth part: that is noise.
+    assert notes["noise"] == pytest.approx(math.hypot(5e-3, 0.02 * math.sqrt(3 / 60)), rel=0.1)
+    # As many components as the fields allow leave nothing of the fields of the fit.
+    few = pca_process(count=16, components=15).notes["process"]
+    assert np.hypot(*few["amplitudes"]) > 0.01
+    # Better than either part on fields that neither has seen.
+    held = torch.from_numpy(rough_fields(40, seed=3))
+    train = rough_fields(60)
+    residual = PRIORS.get("pca_residual").fit(train, components=3).double()
+    process = PRIORS.get("gaussian_process").fit(train, source=sources(60)).double()
+    own = pca_process().log_prob(held, batch(40)).mean()
+    assert own > residual.log_prob(held).mean() + 5
+    assert own > process.log_prob(held, batch(40)).mean() + 5
+
+
+def test_pca_process_holds_the_fields_of_a_source_out_together():
+    kinds = rough_fields(10)
+    fields = np.repeat(kinds, 6, axis=0)
+    fields += 0.002 * np.random.default_rng(2).normal(size=fields.shape)
+    source = np.repeat(np.random.default_rng(3).normal(size=(10, POINTS, 3)), 6, axis=0)
+    fit = PRIORS.get("pca_process").fit
+    together = fit(fields, source=source, components=10).notes["process"]
+    assert np.linalg.norm([*together["amplitudes"], together["affine"], together["noise"]]) > 0.01
+    assert together["sources"] == 10
+    apart = fit(fields, source=sources(60), components=10).notes["process"]
+    assert np.linalg.norm([*apart["amplitudes"], apart["affine"], apart["noise"]]) < 0.005
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_pca_process_of_very_few_fields(count):
+    fields = rough_fields(count)
+    prior = PRIORS.get("pca_process").fit(fields, source=sources(count))
+    assert prior.shape["components"] == count - 1
+    assert prior.notes["process"]["samples"] == count
+    found = prior.log_prob(torch.from_numpy(fields).float(), batch(count, torch.float32))
+    assert found.isfinite().all()
+
+
+def test_pca_process_of_fields_that_components_hold_entirely():
+    mode = np.zeros((POINTS, 3))
+    mode[0, 0] = 1.0
+    fields = np.array([1.0, -1.0, 1.0, -1.0])[:, None, None] * mode
+    prior = PRIORS.get("pca_process").fit(fields, source=sources(4), folds=2)
+    assert prior.process.scales()[1:] == pytest.approx((0.0, 1e-3))
+    assert prior.gaussian(cloud()).kernel.shape == (POINTS, 0)
+    assert prior.penalty(torch.from_numpy(fields).float(), None, batch(4)).isfinite().all()
+
+
+def test_pca_process_prepares_a_source_once(monkeypatch):
+    prior = pca_process()
+    made = []
+    original = prior._factorised
+    monkeypatch.setattr(prior, "_factorised", lambda *a: made.append(len(a[0])) or original(*a))
+    fields = torch.from_numpy(rough_fields(3, seed=1))
+    assert torch.equal(prior.penalty(fields, None, batch(3)), prior.penalty(fields, None, batch(3)))
+    assert made == [POINTS]
+    assert torch.equal(
+        prior.penalty(fields, torch.ones(3, POINTS, dtype=torch.bool), batch(3)),
+        prior.penalty(fields, None, batch(3)),
+    )
+    assert made == [POINTS]
 
 
 def test_smoothness_is_the_naive_double_loop():

@@ -2,7 +2,8 @@
 
 Full field: ``pca`` (the paper's), ``pca_residual`` (what leaves the span costs, too) and
 ``latent_flow`` (a flow in place of the Gaussian). Full field given its source:
-``gaussian_process`` and ``smoothness``. Single vectors: ``flow``.
+``gaussian_process``, ``smoothness`` and ``pca_process`` (``pca`` and a process for what it misses).
+Single vectors: ``flow``.
 """
 
 from dine.priors.base import PRIORS, Prior, load_prior
@@ -10,6 +11,7 @@ from dine.priors.flow import FlowPrior
 from dine.priors.gaussian_process import GaussianProcessPrior
 from dine.priors.latent_flow import LatentFlowPrior
 from dine.priors.pca import PCAPrior
+from dine.priors.pca_process import PCAProcessPrior
 from dine.priors.pca_residual import PCAResidualPrior
 from dine.priors.smoothness import SmoothnessPrior
 
@@ -19,6 +21,7 @@ __all__ = [
     "GaussianProcessPrior",
     "LatentFlowPrior",
     "PCAPrior",
+    "PCAProcessPrior",
     "PCAResidualPrior",
     "Prior",
     "SmoothnessPrior",

@@ -12,6 +12,7 @@ from dine.priors.base import Prior, check_fields
 from dine.priors.flow import FlowPrior
 from dine.priors.gaussian_process import GaussianProcessPrior
 from dine.priors.pca import PCAPrior
+from dine.priors.pca_process import PCAProcessPrior
 from dine.priors.pca_residual import PCAResidualPrior
 from dine.priors.smoothness import SmoothnessPrior
 from dine.priors.sources import check_sources
@@ -39,8 +40,8 @@ def diagnose(
       field. Only these compare between priors. `flow` counts as one, with independent points.
     - `nll_per_component`: for `pca`, which models latent coordinates only: per coordinate of these.
     - `generalisation`: mean distance per point between a held-out field and the prior's closest
-      one. That is its projection to the principal components, or for the Gaussian process the
-      posterior mean after observing the field with the fitted noise.
+      one. That is its projection to the principal components, or for priors with a Gaussian
+      process the posterior mean after observing the field with the fitted noise.
     - `specificity`: mean over 50 samples of the mean distance per point to the nearest training
       field.
     - `in_span`: mean squared Mahalanobis distance per principal component; about 1 on fields like
@@ -85,7 +86,9 @@ def diagnose(
     }
     if isinstance(prior, FlowPrior):
         found["nll_per_coordinate"] = nll / 3
-    elif isinstance(prior, PCAResidualPrior | GaussianProcessPrior | SmoothnessPrior):
+    elif isinstance(
+        prior, PCAResidualPrior | PCAProcessPrior | GaussianProcessPrior | SmoothnessPrior
+    ):
         found["nll_per_coordinate"] = nll / held_out[0].size
     elif isinstance(prior, PCAPrior):
         found["nll_per_component"] = nll / prior.shape["components"]
@@ -93,7 +96,7 @@ def diagnose(
         found["generalisation"] = _distance(prior.projected(fields), fields).mean().item()
         found["in_span"] = prior.mahalanobis(fields).mean().item() / prior.shape["components"]
         found["residual"] = prior.residual(fields).mean().item() / held_out[0].size
-    if isinstance(prior, GaussianProcessPrior):
+    if isinstance(prior, PCAProcessPrior | GaussianProcessPrior):
         found["generalisation"] = _distance(prior.smoothed(fields, points), fields).mean().item()
     return found
 

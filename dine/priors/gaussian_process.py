@@ -30,11 +30,11 @@ WIDTHS = (0.2, 0.4, 0.8, 1.6)
 _TOLERANCE = 1e-6  # of the largest variance: where a root counts as exact
 
 
-class _Factor(NamedTuple):
-    """Covariance of one coordinate at n points: S(I + U diag(s²) Uᵀ)S with S = diag(deviation).
+class Factor(NamedTuple):
+    """Covariance of n numbers, S(I + U diag(s²) Uᵀ)S with S = diag(deviation).
 
     Attributes:
-        deviation: (n, 1) standard deviation of what is independent between points.
+        deviation: (n, 1) standard deviation of what is independent between them.
         basis: U (n, r), orthonormal columns.
         strength: s² (r,).
         log_det: () of the covariance.
@@ -45,8 +45,24 @@ class _Factor(NamedTuple):
     strength: Tensor
     log_det: Tensor
 
+    @classmethod
+    def of_root(cls, root: np.ndarray, deviation: np.ndarray, like: Tensor) -> Factor:
+        """Of the covariance LLᵀ + S² with root L (n, r), in dtype and on device of ``like``."""
+        # Small, and the same with any number of threads.
+        with threadpool_limits(1, user_api="blas"):
+            basis, singular, _ = np.linalg.svd(root / deviation, full_matrices=False)
+        log_det = 2 * np.log(deviation).sum() + np.log1p(singular**2).sum()
+        return cls(
+            *(torch.from_numpy(a).to(like) for a in (deviation, basis, singular**2)),
+            torch.tensor(log_det).to(like),
+        )
+
+    def to(self, like: Tensor) -> Factor:
+        """The same in dtype and on device of ``like``."""
+        return Factor(*(tensor.to(like) for tensor in self))
+
     def whiten(self, field: Tensor) -> Tensor:
-        """(n, 3) to (n, 3) of unit covariance: a sum of squares, in which nothing cancels."""
+        """Columns (n, c) to (n, c) of unit covariance: squares to sum up, of which none cancel."""
         scaled = field / self.deviation
         shrink = 1 - (1 + self.strength).rsqrt()
         return scaled - self.basis @ (shrink[:, None] * (self.basis.T @ scaled))
@@ -76,7 +92,7 @@ class GaussianProcessPrior(Prior):
         self.register_buffer("amplitudes", torch.ones(len(widths)))
         self.register_buffer("affine", torch.ones(()))
         self.register_buffer("noise", torch.ones(()))
-        self._factors: SourceCache[_Factor] = SourceCache()
+        self._factors: SourceCache[Factor] = SourceCache()
 
     @classmethod
     def fit(
@@ -133,16 +149,26 @@ class GaussianProcessPrior(Prior):
         }
         return prior.freeze()
 
-    def _scales(self) -> tuple[tuple[float, ...], float, float]:
+    def scales(self) -> tuple[tuple[float, ...], float, float]:
+        """Amplitudes, affine amplitude and noise as plain numbers."""
         return tuple(self.amplitudes.tolist()), self.affine.item(), self.noise.item()
 
-    def _factor(self, points: np.ndarray, like: Tensor) -> _Factor:
-        """The covariance at points (n, 3), in dtype and on device of ``like``."""
-        scales = self._scales()
+    def factorised(self, points: np.ndarray, like: Tensor) -> Factor:
+        """The covariance of one coordinate at points (n, 3), in dtype and on device of ``like``."""
+        points = np.asarray(points, dtype=np.float64)
+        widths, rank = self.shape["widths"], self.shape["rank"]
+        amplitudes, affine, noise = self.scales()
+        root = covariance_root(points, widths, amplitudes, affine, rank=rank, tolerance=_TOLERANCE)
+        variance = affine**2 * ((points**2).sum(axis=1) + 1) + float(np.square(amplitudes).sum())
+        left_out = np.maximum(variance - np.square(root).sum(axis=1), 0)
+        return Factor.of_root(root, np.sqrt(left_out + noise**2)[:, None], like)
+
+    def _factor(self, points: np.ndarray, like: Tensor) -> Factor:
+        """The same, kept for the sources last seen."""
         return self._factors.get(
             points,
-            (scales, like.dtype, like.device),
-            lambda: _factorised(points, self.shape["widths"], *scales, self.shape["rank"], like),
+            (self.scales(), like.dtype, like.device),
+            lambda: self.factorised(points, like),
         )
 
     def penalty(
@@ -195,35 +221,12 @@ class GaussianProcessPrior(Prior):
 
     def gaussian(self, source: np.ndarray) -> LinearGaussian:
         """The smooth part, without ε, at the points (N, 3) of a source."""
-        amplitudes, affine, _ = self._scales()
+        amplitudes, affine, _ = self.scales()
         return LinearGaussian.of_kernel(
             covariance_root(
                 source, self.shape["widths"], amplitudes, affine, rank=self.shape["rank"]
             )
         )
-
-
-def _factorised(
-    points: np.ndarray,
-    widths: Sequence[float],
-    amplitudes: Sequence[float],
-    affine: float,
-    noise: float,
-    rank: int,
-    like: Tensor,
-) -> _Factor:
-    points = np.asarray(points, dtype=np.float64)
-    root = covariance_root(points, widths, amplitudes, affine, rank=rank, tolerance=_TOLERANCE)
-    variance = affine**2 * ((points**2).sum(axis=1) + 1) + float(np.square(amplitudes).sum())
-    left_out = np.maximum(variance - np.square(root).sum(axis=1), 0)
-    deviation = np.sqrt(left_out + noise**2)[:, None]
-    with threadpool_limits(1, user_api="blas"):  # small, and the same with any number of threads
-        basis, singular, _ = np.linalg.svd(root / deviation, full_matrices=False)
-    log_det = 2 * np.log(deviation).sum() + np.log1p(singular**2).sum()
-    return _Factor(
-        *(torch.from_numpy(a).to(like) for a in (deviation, basis, singular**2)),
-        torch.tensor(log_det).to(like),
-    )
 
 
 def _most_likely(

@@ -111,13 +111,21 @@ class PCAPrior(Prior):
             )
         return prior
 
-    def normalised(self, displacement: Tensor) -> Tensor:
-        """Standardised coordinates (D − μ)/(σ + ε_σ), (B, N, 3) to (B, 3N)."""
+    def check_size(self, displacement: Tensor) -> None:
+        """Refuse fields of another number of points.
+
+        Raises:
+            DataError: they are not (B, N, 3) with the N of the fit.
+        """
         if displacement.shape[1:] != (self.shape["points"], 3):
             raise DataError(
                 f"The PCA prior was fitted to fields of {self.shape['points']} points; found a "
                 f"field of shape {tuple(displacement.shape[1:])}."
             )
+
+    def normalised(self, displacement: Tensor) -> Tensor:
+        """Standardised coordinates (D − μ)/(σ + ε_σ), (B, N, 3) to (B, 3N)."""
+        self.check_size(displacement)
         return (displacement.flatten(1) - self.mean) / self.scale
 
     def latent(self, displacement: Tensor) -> Tensor:
@@ -181,6 +189,15 @@ class PCAPrior(Prior):
         """Displacement per unit of each latent coordinate: (n_c, N, 3)."""
         return (self.basis * self.scale).view(-1, self.shape["points"], 3).numpy()
 
+    def root(self) -> np.ndarray:
+        """Displacement per unit of each whitened coordinate, σ ⊙ VL with Σ_reg = LLᵀ: (n_c, N, 3).
+
+        In float64.
+        """
+        scale, basis, covariance = map(_exact, (self.scale, self.basis, self.covariance))
+        modes = scale * (np.linalg.cholesky(covariance).T @ basis)
+        return modes.reshape(-1, self.shape["points"], 3)
+
     def gaussian(self, source: np.ndarray) -> LinearGaussian:
         """Mean μ and modes σ ⊙ VL with Σ_reg = LLᵀ; the source (N, 3) only has to fit in length.
 
@@ -193,11 +210,10 @@ class PCAPrior(Prior):
                 f"The PCA prior was fitted to fields of {points} points; found a source of "
                 f"{len(source)}."
             )
-        mean, scale, basis, covariance = (
-            tensor.detach().cpu().numpy().astype(np.float64)
-            for tensor in (self.mean, self.scale, self.basis, self.covariance)
-        )
-        modes = scale * (np.linalg.cholesky(covariance).T @ basis)
         return LinearGaussian(
-            mean.reshape(points, 3), modes.reshape(-1, points, 3), np.zeros((points, 0))
+            _exact(self.mean).reshape(points, 3), self.root(), np.zeros((points, 0))
         )
+
+
+def _exact(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().astype(np.float64)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Self
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -18,14 +19,27 @@ LEAST_VARIANCE = 1e-4
 """Smallest σ²: a hundredth of each coordinate's standard deviation, squared."""
 
 
-def residual_variance(
+class Missed(NamedTuple):
+    """What principal components miss of fields that were held out.
+
+    Attributes:
+        rows: (k,) indices of these fields.
+        residual: (k, 3N) in the coordinates standardised over all fields.
+        components: how many there were.
+    """
+
+    rows: np.ndarray
+    residual: np.ndarray
+    components: int
+
+
+def held_out_residuals(
     fields: np.ndarray, components: int, labels: np.ndarray, folds: int, seed: int
-) -> float | None:
-    """Mean square per remaining dimension of what principal components miss of held-out fields.
+) -> Iterator[Missed]:
+    """What the principal components of the other folds miss of each fold's fields.
 
     The fields (K, N, 3) of the fit itself would give far too little: K − 1 components leave nothing
-    of them. So each fold's residuals are those to the components of the other folds, all in the
-    coordinates standardised over the K fields. None where no components can be had that way.
+    of them. Folds are left out where the others do not have two fields.
 
     Args:
         fields: (K, N, 3).
@@ -37,7 +51,6 @@ def residual_variance(
     flat = fields.reshape(len(fields), -1)
     spread = flat.std(axis=0)
     unit = (flat - flat.mean(axis=0)) / np.where(spread > 0, spread, 1)
-    total, dimensions = 0.0, 0
     for held in held_out_folds(labels, folds, seed):
         if np.count_nonzero(~held) < 2:
             continue
@@ -45,8 +58,17 @@ def residual_variance(
         basis = np.linalg.svd(unit[~held] - centre, full_matrices=False)[2]
         basis = basis[: min(components, np.count_nonzero(~held) - 1)]
         offset = unit[held] - centre
-        total += np.square(offset - offset @ basis.T @ basis).sum()
-        dimensions += len(offset) * (unit.shape[1] - len(basis))
+        yield Missed(np.flatnonzero(held), offset - offset @ basis.T @ basis, len(basis))
+
+
+def residual_variance(
+    fields: np.ndarray, components: int, labels: np.ndarray, folds: int, seed: int
+) -> float | None:
+    """Mean square per remaining dimension of :func:`held_out_residuals`; None where none are."""
+    total, dimensions = 0.0, 0
+    for missed in held_out_residuals(fields, components, labels, folds, seed):
+        total += np.square(missed.residual).sum()
+        dimensions += missed.residual.size - len(missed.rows) * missed.components
     return float(total / dimensions) if dimensions else None
 
 
