@@ -609,3 +609,19 @@ def test_test_sets_are_shown_and_decide_nothing():
     assert aside.goal.equals(plain.goal)
     assert "scans, with few methods or pairs, does not count" in said(aside)
     assert "data supplied by the user" in aside.where("scans")
+
+
+def test_targets_of_other_points_have_a_sentence_of_their_own():
+    """There, another method wins than where points are shared."""
+    metrics = made_up()
+    other = metrics["condition"] == "resampled"
+    means = metrics[other].groupby(["dataset", "backbone", "method"])["mce"].mean()
+    best = metrics["method"] == "cpd"
+    metrics.loc[other & best, "mce"] = 0.001 * means.min()
+    text = said(Evidence(metrics, METHODS))
+    value = metrics.loc[other & best, "mce"].mean()
+    part = text[text.index("Where targets were sampled anew") :].split(" | ")[1]
+    assert part.startswith(f"DeformedTissue (synthetic data), Robust-DefReg: CPD {value:.4f}")
+    reference = means["deformedtissue", "robust_defreg", "lambda0"]
+    assert f"{reference:.4f}" in part
+    assert "sampled anew" not in said(Evidence(made_up(corrupted=False), METHODS))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from dine.data.pairs import RESAMPLED
 from dine.evaluation.statistics import NO_BACKBONE
 from dine.reporting.evidence.comparisons import LARGE, PAPER_PRIOR, Evidence, at
 from dine.reporting.evidence.wording import VALUES, are, count_of, join, signed
@@ -32,6 +33,7 @@ def all_findings(evidence: Evidence) -> list[Finding]:
         _best(evidence, evidence.of_group("prior"), "Of the methods trained with a prior"),
         _best(evidence, [evidence.reference, *evidence.rivals], "Of all methods"),
         *_goal(evidence),
+        _other_points(evidence),
         _no_help(evidence),
         _basis(evidence),
         _limits(evidence),
@@ -235,6 +237,34 @@ def _against_classical(evidence: Evidence, methods: Sequence[str]) -> list[Findi
     if left_out:
         text += f" {evidence.titles(left_out)}: left out where evaluated on some pairs only."
     return [Finding(text, tuple(parts))]
+
+
+def _other_points(evidence: Evidence) -> Finding | None:
+    """Where targets hold other points than sources, which decides how far the rest carries."""
+    means = evidence.corrupted
+    means = means[(means["condition"] == RESAMPLED) & means["method"].isin(evidence.methods)]
+    if means.empty:
+        return None
+    able = {evidence.reference, *evidence.rivals}
+    parts = []
+    for place in evidence.places:
+        here = at(means, place)
+        here = here[here["pairs"] == here["pairs"].max()].set_index("method")["mce"]
+        here = here[here.index.isin(able)].sort_values()
+        if len(here) < 2:
+            continue
+        # The best of all, and what readers will look for beside it.
+        shown = [here.index[0]]
+        for group in (evidence.classical, evidence.of_group("test time"), [evidence.reference]):
+            shown += [name for name in here.index if name in group and name not in shown][:1]
+        values = join([f"{evidence.title(name)} {here[name]:.4f}" for name in shown])
+        parts.append(f"{evidence.where(*place)}: {values}.")
+    text = (
+        "The pairs above hold the same points in source and target, which two scans never do, and "
+        "a method may match them one to one. Where targets were sampled anew instead, mean "
+        "correspondence errors are:"
+    )
+    return Finding(text, tuple(parts)) if parts else None
 
 
 def _no_help(evidence: Evidence) -> Finding:
