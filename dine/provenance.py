@@ -44,7 +44,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "models",
     ),
     "priors": ("priors",),
-    "training": ("training",),
+    "training": ("training", "priors/gaussian.py", "priors/sources.py"),
     "evaluation": ("evaluation",),
     "reporting": ("reporting",),
     "calibration": (
@@ -54,7 +54,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "registration/refine.py",
         "registration/shared_points.py",
     ),
-    "registration": ("registration", "evaluation/quality.py"),
+    "registration": ("registration", "evaluation/quality.py", "priors/gaussian.py"),
 }
 
 
