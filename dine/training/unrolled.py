@@ -66,14 +66,16 @@ class Refined(DataTerm):
         found = members(displacement, batch.source_mask, batch.source, "stiff")
         for row, (field, points) in enumerate(found):
             source, target = batch.source[row], batch.target[row]
-            if batch.source_mask is not None:
-                source = source[batch.source_mask[row]]
+            mask = batch.source_mask
+            if mask is not None:
+                source = source[mask[row]]
             if batch.target_mask is not None:
                 target = target[batch.target_mask[row]]
             field = self._one(source, target, field, self._root(points, field.device))
-            fields.append(
-                torch.nn.functional.pad(field, (0, 0, 0, len(displacement[row]) - len(field)))
-            )
+            if mask is not None:
+                full = torch.zeros_like(batch.source[row])
+                field = full.masked_scatter(mask[row].unsqueeze(1), field)
+            fields.append(field)
         return torch.stack(fields)
 
     def _root(self, points: np.ndarray, device: torch.device) -> Tensor:
