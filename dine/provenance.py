@@ -46,7 +46,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "models",
     ),
     "priors": ("priors",),
-    "training": ("training",),
+    "training": ("training", "priors/gaussian.py", "priors/sources.py"),
     "evaluation": ("evaluation",),
     "reporting": ("reporting",),
     "calibration": (
@@ -56,7 +56,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "registration/refine.py",
         "registration/shared_points.py",
     ),
-    "registration": ("registration", "evaluation/quality.py"),
+    "registration": ("registration", "evaluation/quality.py", "priors/gaussian.py"),
 }
 
 

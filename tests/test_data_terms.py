@@ -11,7 +11,7 @@ from dine.errors import ConfigError
 from dine.training.data_terms import DATA_TERMS
 
 ROBUST = ("correntropy", "density_aware", "hyperbolic", "landau")
-OF_CLOUDS = ("chamfer", *ROBUST)  # need no true displacement
+OF_CLOUDS = ("chamfer", *ROBUST, "refined")  # need no true displacement
 
 
 def cloud(count, seed=0):

@@ -7,10 +7,10 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from dine.models.checkpoint import load_backbone
-from dine.priors.gaussian import LinearGaussian, squared_exponential
+from dine.priors.gaussian import LOOSE, STIFF, LinearGaussian, squared_exponential
 from dine.registration.calibration import find_field
 from dine.registration.expectation import Matches, Model
-from dine.registration.refine import LOOSE, STIFF, expected_error, refine
+from dine.registration.refine import expected_error, refine
 from dine.registration.shared_points import SharedPoints
 from dine.training.stages import shipped_weights
 

@@ -16,10 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from dine.priors.gaussian import LinearGaussian
+from dine.priors.gaussian import BOX, OUTLIERS, LinearGaussian
 
-_OUTLIERS = 0.1
-_BOX = 8.0
 _SETTLED = 1e-4
 _LEAST_EXPONENT = np.float32(-60)
 _UNSEEN = 1e-9
@@ -171,11 +169,11 @@ class Model:
         squared = self._squared(source + field)
         if variance is None:
             variance = max(float(np.minimum(squared.min(axis=axis), 0.1).mean()), least)
-        outlier = _OUTLIERS / _BOX
+        outlier = OUTLIERS / BOX
         last, momentum, energy, settled = field, 0, 0.0, False
         half = Result(field, variance, np.inf)
         for number in range(rounds + 1):
-            factor = (1 - _OUTLIERS) / squared.shape[axis] / (2 * np.pi * variance) ** 1.5
+            factor = (1 - OUTLIERS) / squared.shape[axis] / (2 * np.pi * variance) ** 1.5
             weight = self._densities(squared, variance)
             likelihood = factor * weight.sum(axis=axis).astype(np.float64) + outlier
             improbability = energy - float(np.log(likelihood).sum())

@@ -13,12 +13,10 @@ time the most probable one is kept.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from dine.priors.gaussian import LinearGaussian, covariance_root
+from dine.priors.gaussian import LOOSE, STIFF, LinearGaussian
 from dine.registration.expectation import Model
 from dine.registration.shared_points import SharedPoints
 
@@ -30,29 +28,6 @@ _LEAST_ERROR = 0.03
 _UNKNOWN = 0.05
 # Share of matched points at which no other start is tried.
 _ENOUGH = 0.5
-
-
-class Smoothness(NamedTuple):
-    """A Gaussian process of displacements: widths and standard deviations, normalised frame.
-
-    ``affine`` is the standard deviation of an affine part, ``least`` the smallest one of the
-    distances between moved points and their targets.
-    """
-
-    widths: tuple[float, ...]
-    amplitudes: tuple[float, ...]
-    affine: float
-    least: float
-    rank: int
-
-    def at(self, points: np.ndarray) -> LinearGaussian:
-        """The prior of fields at (N, 3) points."""
-        root = covariance_root(points, self.widths, self.amplitudes, self.affine, rank=self.rank)
-        return LinearGaussian.of_kernel(root)
-
-
-STIFF = Smoothness((1.5, 0.4), (0.2, 0.04), 0.05, 0.01, 128)
-LOOSE = Smoothness((1.5, 0.4, 0.25), (0.5, 0.2, 0.04), 0.5, 0.004, 200)
 
 
 def expected_error(spread: np.ndarray | None, points: int) -> np.ndarray:

@@ -86,7 +86,7 @@ class Hyperbolic(ResidualTerm):
     """
 
     def __init__(self, *, alpha: float = 1.0):
-        self.alpha = _positive("alpha", alpha)
+        self.alpha = positive("alpha", alpha)
 
     def cost(self, squared: Tensor) -> Tensor:
         # arccosh(1 + α d²) = 2 arsinh(d √(α/2)), which keeps its digits at small d.
@@ -113,7 +113,7 @@ class Landau(ResidualTerm):
     """
 
     def __init__(self, *, scale: float = 1.0):
-        self.scale = _positive("scale", scale)
+        self.scale = positive("scale", scale)
 
     def cost(self, squared: Tensor) -> Tensor:
         x = _root(squared) / self.scale
@@ -138,7 +138,7 @@ class Correntropy(ResidualTerm):
     """
 
     def __init__(self, *, sigma: float = 0.1):
-        self.sigma = _positive("sigma", sigma)
+        self.sigma = positive("sigma", sigma)
 
     def cost(self, squared: Tensor) -> Tensor:
         return -torch.expm1(squared / (-2 * self.sigma**2))
@@ -168,7 +168,7 @@ class DensityAware(DataTerm):
     """
 
     def __init__(self, *, alpha: float = 40.0, n_lambda: float = 0.5):
-        self.alpha = _positive("alpha", alpha)
+        self.alpha = positive("alpha", alpha)
         if not n_lambda >= 0:
             raise ConfigError(f"n_lambda must not be negative, found {n_lambda}.")
         self.n_lambda = n_lambda
@@ -199,7 +199,12 @@ def _valid(like: Tensor, mask: Tensor | None) -> Tensor:
     return torch.ones_like(like) if mask is None else mask.to(like)
 
 
-def _positive(name: str, value: float) -> float:
+def positive(name: str, value: float) -> float:
+    """A term's parameter, checked.
+
+    Raises:
+        ConfigError: it is not positive.
+    """
     if not value > 0:
         raise ConfigError(f"{name} must be positive, found {value}.")
     return value
