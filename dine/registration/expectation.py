@@ -119,10 +119,15 @@ class Model:
         """How many points of the source or of the target, whichever are fewer, have no match."""
         return min(self._distances.shape)
 
-    def from_matches(self) -> np.ndarray:
-        """The most probable field (N, 3) given the matches alone."""
+    def from_matches(self, field: np.ndarray | None = None, error: float = 1.0) -> np.ndarray:
+        """The most probable field (N, 3) given the matches.
+
+        With a ``field`` (N, 3), also given that it is right elsewhere but for this error.
+        """
         free = len(self._rows)
-        return self._solve(np.zeros((free, 3)), np.zeros(free), 1.0)[0]
+        if field is None:
+            return self._solve(np.zeros((free, 3)), np.zeros(free), 1.0)[0]
+        return self._solve(field[self._free], np.ones(free), error**2)[0]
 
     def _squared(self, moved: np.ndarray) -> np.ndarray:
         """(N, M) squared distances of moved points to targets, float32, valid until the next.

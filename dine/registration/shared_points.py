@@ -25,6 +25,7 @@ _CLOSE = 0.3  # spacings of the target
 _NEIGHBOURS = 8
 _AGREEING = 0.5
 _LEAST = 0.002
+_ERROR = 0.05
 _SHARED = 0.1
 _ROUNDS = 15
 _ATTEMPTS = 6
@@ -58,7 +59,7 @@ class SharedPoints:
         """
         if self._few:
             return field, 0.0
-        found = self.matches(field)
+        start, found = field, self.matches(field)
         if found.known.mean() < _SHARED:
             return field, 0.0
         for _ in range(_ATTEMPTS):
@@ -66,11 +67,14 @@ class SharedPoints:
             left = Model(self.source, self.target, prior, _LEAST, 0, found)
             if left.free < 3:
                 break
-            searched = left.rounds(left.from_matches(), _ROUNDS)[1].field
-            more = self.matches(searched)
+            # Far from all matches the first field may know better than what they suggest.
+            starts = (left.from_matches(), left.from_matches(start, _ERROR))
+            searched = [left.rounds(where, _ROUNDS)[1] for where in starts]
+            field = min(searched, key=lambda result: result.improbability).field
+            more = self.matches(field)
             if more.known.sum() <= found.known.sum():
                 break
-            field, found = searched, more
+            found = more
         exact = found.displacement(self.source, self.target)
         return np.where(found.known[:, None], exact, field), float(found.known.mean())
 
