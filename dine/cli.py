@@ -267,7 +267,8 @@ def corrupt(pairs: Path, condition: str, level: float, levels, seed: int, out: P
 
     Example: dine corrupt --pairs pairs.h5 --condition noise --level 0.03 --out noise.h5
     """
-    from dine.data.pairs import at_levels, make_variant, read_pairs, write_variant
+    from dine.data.corruption import make_variant
+    from dine.data.pairs import at_levels, read_pairs, write_variant
 
     test = read_pairs(pairs, split="test")
     variant = make_variant(at_levels(test, levels), condition, level, seed)
@@ -385,10 +386,10 @@ def fields(model, pairs, targets, batch_size, compute, name, out):
 
     Example: dine fields --model model.safetensors --pairs pairs.h5 --out dvf.h5
     """
-    from dine.training import stages
+    from dine.models.inference import dump_fields
 
     _start_torch()
-    stages.dump_fields(
+    dump_fields(
         model,
         pairs,
         out,
@@ -411,10 +412,10 @@ def fit_prior(fields, settings, seed, out):
 
     Example: dine fit-prior --fields dvf.h5 --settings '{"kind": "pca"}' --out pca.safetensors
     """
-    from dine.training import stages
+    from dine.priors.fitting import fit_prior as run
 
     _start_torch()
-    stages.fit_prior(list(fields), settings, seed=seed, out=out)
+    run(list(fields), settings, seed=seed, out=out)
 
 
 prior_files_option = click.option(
@@ -440,12 +441,10 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute
     Example: dine search-lambda --pairs pairs.h5 --model model.safetensors --prior pca
     pca.safetensors --out lambda.json
     """
-    from dine.training import stages
+    from dine.training.stage2 import search_lambda as run
 
     _start_torch()
-    stages.search_lambda(
-        pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, compute=compute
-    )
+    run(pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, compute=compute)
 
 
 @cli.command()
@@ -467,7 +466,8 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, 
     Example: dine stage2 --pairs pairs.h5 --model model.safetensors --variant pca --prior
     pca.safetensors --lambda lambda.json --out runs/pca
     """
-    from dine.training import stages
+    from dine.training.stage2 import selected_lambda
+    from dine.training.stage2 import stage2 as run
 
     _start_torch()
     if prior is None:
@@ -478,8 +478,8 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, 
         try:
             value = float(weight)
         except ValueError:
-            value = stages.selected_lambda(Path(weight), variant)
-    stages.stage2(
+            value = selected_lambda(Path(weight), variant)
+    run(
         pairs,
         model,
         settings,
@@ -603,7 +603,7 @@ def classical(pairs, variants, algorithm, arguments, name, out):
 
     Example: dine classical --pairs pairs.h5 --algorithm cpd --out cpd.h5
     """
-    from dine.registration.predictions import classical_predictions as run
+    from dine.registration.classical_predictions import classical_predictions as run
 
     run(
         pairs, list(variants), out, algorithm=algorithm, arguments=arguments, name=name or algorithm
@@ -670,7 +670,7 @@ def report(results, settings, out):
 
     Example: dine report --results results --settings @config.yaml --out results/report.html
     """
-    from dine.reporting.build import build_report
+    from dine.reporting.report import build_report
 
     build_report(results, settings, out)
 
@@ -928,8 +928,8 @@ def calibrate(model, pairs, targets, prior, device, out):
     Example: dine calibrate --model model.safetensors --pairs pairs.h5 --prior
     pca.safetensors --out calibration.json
     """
+    from dine.models.inference import chosen_device
     from dine.registration.calibration import calibrate as run
-    from dine.training.parallel import chosen_device
 
     _start_torch()
     run(

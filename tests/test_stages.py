@@ -23,9 +23,11 @@ from dine.data.pairs import read_pairs, read_seen, read_variant, write_pairs
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.evaluation.quality import chamfer
 from dine.files import read_json
+from dine.models.inference import predict_fields
 from dine.priors import load_prior
 from dine.training import stages
 from dine.training.data_terms import DATA_TERMS
+from dine.training.stage2 import selected_lambda
 
 STAGE1 = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
 STAGE2 = '{"steps": 2, "validate_every": 2, "validation_pairs": 1}'
@@ -88,7 +90,7 @@ def test_fields_are_the_models_own_on_the_training_split(chain):
     stored = read_fields(chain / "dvf.h5")
     train = read_pairs(chain / "pairs.h5", split="train")
     backbone, _ = stages.load_backbone(chain / "stage1" / "model.safetensors")
-    again = stages.predict_fields(backbone, train, name="again", batch_size=1)
+    again = predict_fields(backbone, train, name="again", batch_size=1)
     assert stored.displacement.shape == train.source.shape
     # Batched or alone, and whatever the order of the target's points.
     assert np.abs(stored.displacement - again.displacement).max() < 1e-4
@@ -104,9 +106,9 @@ def test_lambda_is_the_best_candidate_on_validation_pairs(chain):
     assert sorted(curve["lambda"]) == [0, 0.001, 0.1]
     tried = curve[curve["lambda"] > 0]
     assert result["selected"]["pca"] == tried.loc[tried["cd"].idxmin(), "lambda"]
-    assert stages.selected_lambda(chain / "lambda.json", "pca") == result["selected"]["pca"]
+    assert selected_lambda(chain / "lambda.json", "pca") == result["selected"]["pca"]
     # A prior without a search of its own takes the default's.
-    assert stages.selected_lambda(chain / "lambda.json", "flow") == result["selected"]["pca"]
+    assert selected_lambda(chain / "lambda.json", "flow") == result["selected"]["pca"]
 
 
 def run_stage2(chain, out, *arguments):
@@ -266,9 +268,9 @@ def test_truncated_inputs_are_named(chain, tmp_path):
     with pytest.raises(CheckpointError, match=r"pca\.safetensors"):
         load_prior(damaged(chain / "pca.safetensors", tmp_path))
     with pytest.raises(DataError, match=r"lambda\.json"):
-        stages.selected_lambda(damaged(chain / "lambda.json", tmp_path), "pca")
+        selected_lambda(damaged(chain / "lambda.json", tmp_path), "pca")
     with pytest.raises(DataError, match=r"not the result of `dine search-lambda`"):
-        stages.selected_lambda(chain / "raw.json", "pca")
+        selected_lambda(chain / "raw.json", "pca")
     assert not (tmp_path / "x").exists()
     assert not (tmp_path / "x.h5").exists()
 
@@ -385,7 +387,8 @@ def test_a_folder_of_undeformed_meshes_becomes_a_dataset(chain, tmp_path):
 def test_a_folder_in_the_published_layout_is_used_as_it_is(chain, tmp_path):
     dataset = config.Dataset(source={"kind": "path", "folder": str(chain / "raw")})
     obtain(dataset, tmp_path, seed=0)
-    assert read_json(tmp_path / "raw.json") == {"folder": str(chain / "raw"), "origin": "path"}
+    facts = read_json(tmp_path / "raw.json")
+    assert (facts["folder"], facts["origin"]) == (str(chain / "raw"), "path")
     listed = dine("inspect", chain / "raw").output
     assert "deformation" in listed
     assert "0.5" in listed

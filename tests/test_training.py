@@ -14,11 +14,11 @@ from dine.data.loading import Batches
 from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
 from dine.models.backbones import Backbone, Registration
+from dine.models.inference import chosen_device
 from dine.priors import PRIORS
 from dine.training import loop
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
-from dine.training.parallel import chosen_device
 from dine.training.stages import new_backbone
 from dine.training.state import Interrupted, one_writer
 

@@ -28,9 +28,10 @@ from dine.evaluation.quality import roughness
 from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import Backbone
+from dine.models.inference import chosen_device
 from dine.progress import Progress
 from dine.training.objective import Loss, Objective
-from dine.training.parallel import Alone, Team, chosen_device, run_together
+from dine.training.parallel import Alone, Team, run_together
 from dine.training.state import Interrupted, StopRequest, load_state, one_writer, save_state
 
 log = logging.getLogger(__name__)

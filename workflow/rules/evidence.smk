@@ -92,7 +92,7 @@ rule evidence_resample:
     params:
         levels=options("--at", CONFIG.evidence.at_levels),
         seed=CONFIG.seed,
-        code=code_digest("pairs"),
+        code=code_digest("resample"),
     shell:
         "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
         " {params.levels} --seed {params.seed} --out {output:q}"
@@ -122,7 +122,7 @@ rule evidence_lambda:
         settings=evidence_search,
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=code_digest("model", "priors", "training"),
+        code=searched_code,
     shell:
         "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
         " --model {input.model:q} --prior {wildcards.trained} {input.prior:q}"
@@ -152,7 +152,7 @@ rule stage2_method:
         settings=method_stage2,
         seed=training_seed,
         compute=COMPUTE,
-        code=code_digest("model", "priors", "training"),
+        code=method_code,
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --variant {wildcards.trained} {params.prior}"
@@ -189,7 +189,7 @@ rule evidence_predict:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=code_digest("model", "evaluation"),
+        code=lambda wildcards: code_of("predict", wildcards.cell_backbone),
     shell:
         "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
         " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
@@ -222,7 +222,7 @@ rule evidence_refine:
         variants=variant_options,
         prior=refined_prior_options,
         settings=lambda wildcards: section(CONFIG.evidence.methods[wildcards.refined]),
-        code=code_digest("priors", "training", "evaluation", "registration"),
+        code=refined_code,
     shell:
         "dine --log {log:q} --threads {threads} refine-predictions"
         " --predictions {input.predictions:q} --pairs {input.pairs:q} {params.variants}"
@@ -249,7 +249,9 @@ rule evidence_classical:
         arguments=lambda wildcards: json.dumps(
             CONFIG.evidence.methods[wildcards.classical].arguments, sort_keys=True
         ),
-        code=code_digest("evaluation", "registration"),
+        code=lambda wildcards: code_digest(
+            "classical", CONFIG.evidence.methods[wildcards.classical].algorithm
+        ),
     shell:
         "dine --log {log:q} --threads {threads} classical --pairs {input.pairs:q}"
         " {params.variants} --algorithm {params.algorithm:q} --arguments {params.arguments:q}"
@@ -273,7 +275,7 @@ rule evidence_evaluate:
     params:
         variants=variant_options,
         runs=group_options,
-        code=code_digest("evaluation"),
+        code=code_digest("evaluate"),
     shell:
         "dine --log {log:q} evaluate {params.runs} --pairs {input.pairs:q}"
         " {params.variants} --dataset {wildcards.dataset} --backbone {wildcards.group}"
@@ -295,7 +297,7 @@ rule evidence_diagnose:
         "../envs/dine.yaml"
     params:
         seed=CONFIG.seed,
-        code=code_digest("priors", "reporting"),
+        code=lambda wildcards: code_of("diagnose", priors=[wildcards.prior]),
     shell:
         "dine --log {log:q} diagnose --prior {input.prior:q} --fields {input.fields:q}"
         " --pairs {input.pairs:q} --dataset {wildcards.dataset} --backbone {wildcards.backbone}"
@@ -322,7 +324,7 @@ rule evidence:
         diagnostics=lambda wildcards, input: options("--diagnostics", input.diagnostics),
         methods=evidence_method_texts(),
         settings=section(CONFIG),
-        code=code_digest("reporting", "evaluation"),
+        code=code_digest("evidence"),
     shell:
         "dine --log {log:q} evidence {input.metrics:q} {params.searches} {params.diagnostics}"
         " --methods {params.methods:q} --settings {params.settings:q}"

@@ -19,7 +19,9 @@ rule calibrate:
     params:
         prior=lambda wildcards, input: options("--prior", input.prior),
         device=CONFIG.device,
-        code=code_digest("model", "priors", "calibration"),
+        code=lambda wildcards: code_of(
+            "calibrate", wildcards.backbone, priors=calibrating_priors(wildcards)
+        ),
     shell:
         "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
         " --pairs {input.pairs:q} {params.prior} --device {params.device}"
