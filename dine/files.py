@@ -55,16 +55,40 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(temporary, path)
         temporary = None
     except Exception as error:
-        reason = _storage_reason(error, path.parent)
-        if reason is None:
+        shown = _storage_error(error, path, path.parent)
+        if shown is error:
             raise
-        raise StorageError(
-            f"Could not write {path}: {reason}; free space or choose another folder, then run "
-            "the same command again."
-        ) from error
+        raise shown from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def storage_errors(path: str | os.PathLike) -> Iterator[None]:
+    """Say plainly that storage refused what the block does to ``path`` itself.
+
+    Raises:
+        StorageError: the disk is full or the folder cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        shown = _storage_error(error, Path(path), Path(path))
+        if shown is error:
+            raise
+        raise shown from error
+
+
+def _storage_error(error: Exception, path: Path, folder: Path) -> Exception:
+    """The error as the user should see it; itself where storage is not the cause."""
+    reason = _storage_reason(error, folder)
+    if reason is None:
+        return error
+    return StorageError(
+        f"Could not write {path}: {reason}; free space or choose another folder, then run the "
+        "same command again."
+    )
 
 
 def _storage_reason(error: Exception, folder: Path) -> str | None:
@@ -75,6 +99,8 @@ def _storage_reason(error: Exception, folder: Path) -> str | None:
     full = _STORAGE_ERRNOS[errno.ENOSPC]
     if "no space left on device" in str(error).lower():
         return full
+    if isinstance(error, TimeoutError):
+        return None
     if isinstance(error, RuntimeError | OSError) and folder.is_dir():
         return full if shutil.disk_usage(folder).free < _FULL_BYTES else None
     return None

@@ -156,7 +156,7 @@ def test_a_second_writer_is_refused(tmp_path):
     release, held = threading.Event(), threading.Event()
 
     def hold():
-        with one_writer(tmp_path):
+        with one_writer(tmp_path, IDENTITY):
             held.set()
             release.wait(10)
 

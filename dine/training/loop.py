@@ -208,7 +208,7 @@ def _train(
     batches = Batches(train_pairs, team.device, train_targets, settings.parts)
     val_batches = Batches(val_pairs, team.device, val_targets)
     path = folder / STATE
-    with one_writer(folder) if team.leads else contextlib.nullcontext():
+    with one_writer(folder, identity) if team.leads else contextlib.nullcontext():
         team.wait()  # until the folder is ours
         state, message = load_state(path, identity)
         log.info("%s: %s", name, message)

@@ -20,6 +20,7 @@ from dine.provenance import code_digest, run_record
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import history_csv, train
 from dine.training.objective import Objective
+from dine.training.state import check_still_wanted
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
@@ -126,6 +127,7 @@ def run(
         device=compute.device,
         processes=compute.processes,
     )
+    check_still_wanted(out / "training", identity, name)
     # Weights carry nothing that differs between two equal runs, so they can be compared by bytes.
     save_backbone(out / "model.safetensors", backbone, name=name, seed=seed, steps=settings.steps)
     write_text(out / "history.csv", history_csv(history))

@@ -79,6 +79,14 @@ def section(model):
     return json.dumps(model.model_dump(mode="json", exclude_none=True), sort_keys=True)
 
 
+def drawn_settings():
+    """What the figures need to know; other settings reach them through files, or not at all."""
+    drawn = {"datasets", "backbones", "priors", "lambda_search"}
+    return json.dumps(
+        CONFIG.model_dump(mode="json", exclude_none=True, include=drawn), sort_keys=True
+    )
+
+
 def options(flag, *columns):
     """A repeated command-line option, quoted for the shell: one for each row of the columns."""
     return " ".join(shlex.join([flag, *map(str, row)]) for row in zip(*columns))

@@ -63,7 +63,7 @@ rule figures:
         "../envs/dine.yaml"
     params:
         results=RESULTS,
-        settings=section(CONFIG),
+        settings=drawn_settings(),
         code=code_digest("figures"),
     shell:
         "dine --log {log:q} figures --results {params.results:q} --settings {params.settings:q}"
