@@ -13,7 +13,7 @@ import click
 
 from dine import __version__, config
 from dine.errors import ConfigError, DataError, DineError
-from dine.files import write_json, write_text
+from dine.files import storage_errors, write_json, write_text
 
 # Heavy modules (torch, matplotlib) are imported by the command that needs them.
 
@@ -126,8 +126,10 @@ def cli(log_file: Path | None, threads: int | None):
     """Non-rigid registration of point clouds with learned deformation priors."""
     handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
     if log_file is not None:
-        log_file.parent.mkdir(parents=True, exist_ok=True)
-        handlers.append(logging.FileHandler(log_file, encoding="utf-8"))
+        with storage_errors(log_file.parent):
+            log_file.parent.mkdir(parents=True, exist_ok=True)
+            handlers.append(logging.FileHandler(log_file, encoding="utf-8"))
+        logging.raiseExceptions = False  # a log that fills the disk is not what to read about
     logging.basicConfig(
         level=logging.INFO,
         format="%(asctime)s %(message)s",

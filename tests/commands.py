@@ -4,6 +4,7 @@ from click.testing import CliRunner
 
 from dine import cli
 
+RAW = '{"recipe": {"shape": "tissue", "objects": 4, "levels": [0.2, 0.5]}, "pairs": {"points": 64}}'
 STAGE1 = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
 STAGE2 = '{"steps": 2, "validate_every": 2, "validation_pairs": 1}'
 

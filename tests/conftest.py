@@ -2,7 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
-from commands import STAGE1, STAGE2, dine
+from commands import RAW, STAGE1, STAGE2, dine
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -19,11 +19,7 @@ def shared() -> Path:
 def chain(tmp_path_factory):
     """One small run of every step."""
     root = tmp_path_factory.mktemp("run")
-    settings = {
-        "recipe": {"shape": "tissue", "objects": 4, "levels": [0.2, 0.5]},
-        "pairs": {"points": 64},
-    }
-    dine("raw", "--settings", json.dumps(settings), "--seed", 1, "--out", root)
+    dine("raw", "--settings", RAW, "--seed", 1, "--out", root)
     pairs = root / "pairs.h5"
     split = {"train": 0.5, "val": 0.25, "test": 0.25}
     dine(

@@ -2,12 +2,12 @@
 
 import errno
 import os
-import subprocess
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from disks import mounted
 
 from dine.errors import DataError, StorageError
 from dine.files import atomic_path, digest, read_json, write_json, write_text
@@ -53,17 +53,8 @@ def test_other_errors_pass_through(tmp_path):
 @pytest.fixture
 def small_disk(tmp_path):
     """A real file system of 64 KiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(place)]
-    try:
-        done = subprocess.run(mount, capture_output=True)
-    except FileNotFoundError:
-        pytest.skip("mount is not installed")
-    if done.returncode:
-        pytest.skip("mounting a small file system needs root")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
+    with mounted(tmp_path / "disk", "64k") as place:
+        yield place
 
 
 def write_h5(path):

@@ -127,7 +127,7 @@ def training_command(chain, out, steps=40, processes=1):
 
 
 def wait_for(path, there=True):
-    give_up = time.monotonic() + 60
+    give_up = time.monotonic() + 300
     while path.exists() != there and time.monotonic() < give_up:
         time.sleep(0.01)
 
