@@ -2,6 +2,9 @@
 
 import errno
 import os
+import re
+import subprocess
+import sys
 
 import h5py
 import numpy as np
@@ -34,6 +37,30 @@ def test_the_temporary_file_keeps_the_suffix_and_parents_are_made(tmp_path):
         assert temporary.suffix == ".ply"
         temporary.write_text("x")
     assert (tmp_path / "new" / "mesh.ply").read_text() == "x"
+
+
+def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path):
+    code = """if True:
+        import os, signal, sys
+        from dine.files import atomic_path
+        with atomic_path(sys.argv[1]) as temporary:
+            temporary.write_text("half of")
+            os.kill(os.getpid(), signal.SIGKILL)
+    """
+    path = tmp_path / "result.ply"
+    subprocess.run([sys.executable, "-c", code, str(path)])
+    (left,) = os.listdir(tmp_path)
+    # What a living process writes stays, and so does what another machine may be writing.
+    number = re.search(r"(\d+)@", left)[1]
+    others = {
+        left.replace(f"{number}@", f"{os.getpid()}@"),
+        left.replace("@", "@other-"),
+        ".result.part.ply",
+    }
+    for name in others:
+        (tmp_path / name).touch()
+    write_text(path, "whole")
+    assert set(os.listdir(tmp_path)) == {"result.ply", *others}
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])

@@ -50,6 +50,12 @@ def order_of(step: int, batch_size: int, count: int, seed: int) -> np.ndarray:
     return np.array([orders[e][p] for e, p in zip(epochs, positions % count, strict=True)])
 
 
+def seed_torch(seed: int, step: int, rank: int) -> None:
+    """Seed what a backbone may draw in a step, such as dropout."""
+    state = np.random.SeedSequence([seed, 3, step, rank]).generate_state(1, np.uint64)
+    torch.manual_seed(int(state[0]))
+
+
 def share_of(team: Team, step: int, batch_size: int, count: int, seed: int) -> Request:
     """What one process takes of a step's batch."""
     positions = np.split(np.arange(batch_size), team.size)[team.rank]
@@ -240,10 +246,12 @@ def _train(
             share_of(team, step, settings.batch_size, len(batches), seed) for step in steps
         )
         with (
+            torch.random.fork_rng(devices=[]),
             contextlib.closing(stream),
             Progress(name, settings.steps, start, quiet=not team.leads) as progress,
         ):
             for step, (batch, truth) in zip(steps, stream, strict=True):
+                seed_torch(seed, step, team.rank)
                 rate = learning_rate(settings, step)
                 for group in optimiser.param_groups:
                     group["lr"] = rate

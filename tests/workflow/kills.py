@@ -122,7 +122,9 @@ def perform(
     if job is None:
         return False
     began = time.monotonic()
-    time.sleep(kill.moment * usual.get(kill.step, 2.0))
+    due = began + kill.moment * usual[kill.step]
+    while time.monotonic() < due and job.process.is_running():
+        time.sleep(0.01)
     if process.poll() is not None:
         return False
     kill.running = " ".join(sorted(job.step for job in place.jobs()))
