@@ -5,7 +5,7 @@ PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
 
-.PHONY: run tiny test check format docs wheel-check
+.PHONY: run tiny test kill-test check format docs wheel-check
 
 run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
@@ -15,6 +15,10 @@ tiny: .venv/installed
 
 test: .venv/installed
 	$(BIN)/pytest
+
+# The workflow killed at random moments in every step, and run again: some twenty minutes.
+kill-test: .venv/installed
+	$(BIN)/python tests/workflow/kills.py --record results/kills.csv
 
 # What must hold before a commit, tests apart.
 check: .venv/installed

@@ -13,7 +13,7 @@ import click
 
 from dine import __version__, config
 from dine.errors import ConfigError, DataError, DineError
-from dine.files import write_json, write_text
+from dine.files import storage_errors, write_json, write_text
 
 # Heavy modules (torch, matplotlib) are imported by the command that needs them.
 
@@ -126,8 +126,10 @@ def cli(log_file: Path | None, threads: int | None):
     """Non-rigid registration of point clouds with learned deformation priors."""
     handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
     if log_file is not None:
-        log_file.parent.mkdir(parents=True, exist_ok=True)
-        handlers.append(logging.FileHandler(log_file, encoding="utf-8"))
+        with storage_errors(log_file.parent):
+            log_file.parent.mkdir(parents=True, exist_ok=True)
+            handlers.append(logging.FileHandler(log_file, encoding="utf-8"))
+        logging.raiseExceptions = False  # a log that fills the disk is not what to read about
     logging.basicConfig(
         level=logging.INFO,
         format="%(asctime)s %(message)s",
@@ -269,7 +271,8 @@ def corrupt(pairs: Path, condition: str, level: float, levels, seed: int, out: P
 
     Example: dine corrupt --pairs pairs.h5 --condition noise --level 0.03 --out noise.h5
     """
-    from dine.data.pairs import at_levels, make_variant, read_pairs, write_variant
+    from dine.data.corruption import make_variant
+    from dine.data.pairs import at_levels, read_pairs, write_variant
 
     test = read_pairs(pairs, split="test")
     variant = make_variant(at_levels(test, levels), condition, level, seed)
@@ -387,10 +390,10 @@ def fields(model, pairs, targets, batch_size, compute, name, out):
 
     Example: dine fields --model model.safetensors --pairs pairs.h5 --out dvf.h5
     """
-    from dine.training import stages
+    from dine.models.inference import dump_fields
 
     _start_torch()
-    stages.dump_fields(
+    dump_fields(
         model,
         pairs,
         out,
@@ -413,10 +416,10 @@ def fit_prior(fields, settings, seed, out):
 
     Example: dine fit-prior --fields dvf.h5 --settings '{"kind": "pca"}' --out pca.safetensors
     """
-    from dine.training import stages
+    from dine.priors.fitting import fit_prior as run
 
     _start_torch()
-    stages.fit_prior(list(fields), settings, seed=seed, out=out)
+    run(list(fields), settings, seed=seed, out=out)
 
 
 prior_files_option = click.option(
@@ -442,12 +445,10 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute
     Example: dine search-lambda --pairs pairs.h5 --model model.safetensors --prior pca
     pca.safetensors --out lambda.json
     """
-    from dine.training import stages
+    from dine.training.stage2 import search_lambda as run
 
     _start_torch()
-    stages.search_lambda(
-        pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, compute=compute
-    )
+    run(pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, compute=compute)
 
 
 @cli.command()
@@ -469,7 +470,8 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, 
     Example: dine stage2 --pairs pairs.h5 --model model.safetensors --variant pca --prior
     pca.safetensors --lambda lambda.json --out runs/pca
     """
-    from dine.training import stages
+    from dine.training.stage2 import selected_lambda
+    from dine.training.stage2 import stage2 as run
 
     _start_torch()
     if prior is None:
@@ -480,8 +482,8 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, 
         try:
             value = float(weight)
         except ValueError:
-            value = stages.selected_lambda(Path(weight), variant)
-    stages.stage2(
+            value = selected_lambda(Path(weight), variant)
+    run(
         pairs,
         model,
         settings,
@@ -605,7 +607,7 @@ def classical(pairs, variants, algorithm, arguments, name, out):
 
     Example: dine classical --pairs pairs.h5 --algorithm cpd --out cpd.h5
     """
-    from dine.registration.predictions import classical_predictions as run
+    from dine.registration.classical_predictions import classical_predictions as run
 
     run(
         pairs, list(variants), out, algorithm=algorithm, arguments=arguments, name=name or algorithm
@@ -672,7 +674,7 @@ def report(results, settings, out):
 
     Example: dine report --results results --settings @config.yaml --out results/report.html
     """
-    from dine.reporting.build import build_report
+    from dine.reporting.report import build_report
 
     build_report(results, settings, out)
 
@@ -956,8 +958,8 @@ def calibrate(model, pairs, targets, prior, device, out):
     Example: dine calibrate --model model.safetensors --pairs pairs.h5 --targets resampled.h5
     --prior pca.safetensors --out calibration.json
     """
+    from dine.models.inference import chosen_device
     from dine.registration.calibration import calibrate as run
-    from dine.training.parallel import chosen_device
 
     _start_torch()
     run(

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import hashlib
 import json
 import os
+import platform
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -26,13 +29,18 @@ _STORAGE_ERRNOS = {
 }
 
 
+# In the name of a temporary file, after the number of the process that writes it.
+_HERE = f"@{platform.node()[:32]}."
+_TEMPORARY = re.compile(rf"\..*\.(\d+){re.escape(_HERE)}[^.]*\.part(?:\..*)?")
+
+
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` that replaces it only if the block succeeds.
 
     The temporary name keeps the suffix of ``path``, so that writers that choose a format by name
     work. Missing parent folders are made. On any exception the temporary file is removed and a
-    file already at ``path`` stays as it was.
+    file already at ``path`` stays as it was. What killed processes left in the folder goes, too.
 
     Raises:
         StorageError: the disk is full or the folder cannot be written.
@@ -41,8 +49,11 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _tidy(path.parent.resolve(), os.getpid())
         handle, name = tempfile.mkstemp(
-            prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent
+            prefix=f".{path.stem}.{os.getpid()}{_HERE}",
+            suffix=f".part{path.suffix}",
+            dir=path.parent,
         )
         os.close(handle)
         temporary = Path(name)
@@ -55,16 +66,60 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(temporary, path)
         temporary = None
     except Exception as error:
-        reason = _storage_reason(error, path.parent)
-        if reason is None:
+        shown = _storage_error(error, path, path.parent)
+        if shown is error:
             raise
-        raise StorageError(
-            f"Could not write {path}: {reason}; free space or choose another folder, then run "
-            "the same command again."
-        ) from error
+        raise shown from error
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+@functools.cache
+def _tidy(folder: Path, process: int) -> None:
+    """Remove what dead processes of this machine were writing; once for each of ours."""
+    for entry in os.scandir(folder):
+        found = _TEMPORARY.fullmatch(entry.name)
+        if found and not _lives(int(found[1])):
+            with contextlib.suppress(OSError):  # another process may tidy up as well
+                os.unlink(entry.path)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
+
+
+@contextlib.contextmanager
+def storage_errors(path: str | os.PathLike) -> Iterator[None]:
+    """Say plainly that storage refused what the block does to ``path`` itself.
+
+    Raises:
+        StorageError: the disk is full or the folder cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        shown = _storage_error(error, Path(path), Path(path))
+        if shown is error:
+            raise
+        raise shown from error
+
+
+def _storage_error(error: Exception, path: Path, folder: Path) -> Exception:
+    """The error as the user should see it; itself where storage is not the cause."""
+    reason = _storage_reason(error, folder)
+    if reason is None:
+        return error
+    return StorageError(
+        f"Could not write {path}: {reason}; free space or choose another folder, then run the "
+        "same command again."
+    )
 
 
 def _storage_reason(error: Exception, folder: Path) -> str | None:
@@ -75,6 +130,8 @@ def _storage_reason(error: Exception, folder: Path) -> str | None:
     full = _STORAGE_ERRNOS[errno.ENOSPC]
     if "no space left on device" in str(error).lower():
         return full
+    if isinstance(error, TimeoutError):
+        return None
     if isinstance(error, RuntimeError | OSError) and folder.is_dir():
         return full if shutil.disk_usage(folder).free < _FULL_BYTES else None
     return None

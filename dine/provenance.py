@@ -1,77 +1,224 @@
-"""Who made a result: code, versions, inputs. Cheap to import, since every DAG asks for it."""
+"""Who made a result: code, versions, inputs. Cheap to import, since every DAG asks for it.
+
+The code behind a step is found by reading, without running any of it: the step's command in
+``dine.cli``, the modules that it imports, those that they import, and so on; and the modules of the
+classes that the configuration names, a user's own among them.
+"""
 
 from __future__ import annotations
 
+import ast
 import csv
 import functools
 import hashlib
 import os
 import platform
+import re
+import sys
+import sysconfig
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from dine import __version__
+from dine.errors import ConfigError
 
 PACKAGE = Path(__file__).parent
 
-_READING = ("data/surface.py", "data/readers.py", "data/manifest.py", "data/layout.py")
+NEUTRAL = frozenset(
+    f"dine{name}"
+    for name in (
+        "",
+        ".cli",
+        ".config",
+        ".errors",
+        ".files",
+        ".progress",
+        ".provenance",
+        ".registry",
+        ".results",
+    )
+)
+"""Modules that everything uses: what they do to results is in the settings, or nothing."""
 
-LAYERS: dict[str, tuple[str, ...]] = {
-    # What a step's result depends on, as paths below the package.
-    "raw": (
-        *_READING,
-        "data/obtain.py",
-        "data/raw.py",
-        "data/synthetic.py",
-        "data/deformation.py",
-        "data/sampling.py",
-        "data/dataverse.py",
-    ),
-    "pairs": (
-        *_READING,
-        "data/prepare.py",
-        "data/pairs.py",
-        "data/sampling.py",
-        "data/assignment.py",
-    ),
-    "corrupt": ("data/corruption.py", "data/pairs.py"),
-    "model": (
-        "data/batch.py",
-        "data/loading.py",
-        "data/pairs.py",
-        "data/fields.py",
-        "geometry",
-        "models",
-    ),
-    "priors": ("priors",),
-    "training": ("training", "priors/gaussian.py", "priors/sources.py"),
-    "evaluation": ("evaluation",),
-    "reporting": ("reporting",),
-    "calibration": (
-        "evaluation/quality.py",
-        "registration/calibration.py",
-        "registration/expectation.py",
-        "registration/refine.py",
-        "registration/shared_points.py",
-    ),
-    "registration": ("registration", "evaluation/quality.py", "priors/gaussian.py"),
-}
+_DATA = re.compile(r"""["']([\w-]+\.(?:html|csv|js|txt))["']""")
+_REGISTERED = re.compile(r"""\.register\("(\w+)"\)""")
+_INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("purelib", "platlib", "stdlib"))
 
 
 @functools.cache
-def code_digest(*layers: str) -> str:
-    """Digest of the source files behind some layers: changes when their code does."""
-    digest = hashlib.sha256()
-    for entry in sorted({entry for layer in layers for entry in LAYERS[layer]}):
-        path = PACKAGE / entry
-        files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
-        for file in files:
-            if file.suffix in {".py", ".html", ".csv"}:
-                digest.update(str(file.relative_to(PACKAGE)).encode())
-                digest.update(hashlib.sha256(file.read_bytes()).digest())
+def code_digest(step: str, *classes: str) -> str:
+    """Digest of the code behind a step: changes when that does.
+
+    Args:
+        step: a command of ``dine``, such as ``fit-prior``.
+        classes: what the configuration picks for it: built-in names and import paths
+            ``package.module:Class``.
+
+    Raises:
+        ConfigError: no such class, or its module is not on the Python path.
+    """
+    digest = hashlib.sha256(_command(step)[0].encode())
+    for name, file in sorted(code_files(step, *classes).items()):
+        digest.update(name.encode())
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()[:16]
+
+
+@functools.cache
+def code_files(step: str, *classes: str) -> dict[str, Path]:
+    """The source files behind a step, and what they read from beside themselves, by name.
+
+    Arguments and errors as for :func:`code_digest`.
+    """
+    found: dict[str, Path] = {}
+    for module in _command(step)[1]:
+        _follow(module, ("dine",), found)
+    for name in classes:
+        for module in _modules_of(name):
+            _follow(module, ("dine", module.partition(".")[0]), found)
+    return found
+
+
+@functools.cache
+def _command(step: str) -> tuple[str, tuple[str, ...]]:
+    """What a command does, as text without its help, and the modules that it imports."""
+    name = step.replace("-", "_")
+    for node in _parsed(PACKAGE / "cli.py").body:
+        if isinstance(node, ast.FunctionDef) and node.name == name:
+            body = node.body[1:] if ast.get_docstring(node) else node.body
+            return ast.dump(ast.Module(body, [])), tuple(_imports(body, "dine.cli", False))
+    raise KeyError(step)
+
+
+def _modules_of(name: str) -> list[str]:
+    """The modules behind a class's name: of an import path, or where a built-in is registered."""
+    if ":" not in name:
+        if name in _registered():
+            return _registered()[name]
+        raise ConfigError(
+            f"Unknown class {name!r}; expected one of {', '.join(sorted(_registered()))} or an "
+            "import path 'package.module:Class'."
+        )
+    module = name.partition(":")[0]
+    if _source(module) is None:
+        raise ConfigError(
+            f"The class {name!r} cannot be found: there is no Python file of the module "
+            f"{module!r} on the Python path (PYTHONPATH, or install the package)."
+        )
+    return [module]
+
+
+@functools.cache
+def _registered() -> dict[str, list[str]]:
+    """Modules of ``dine`` by the names under which they register classes."""
+    found: dict[str, list[str]] = {}
+    for file in sorted(PACKAGE.rglob("*.py")):
+        module = ".".join(("dine", *file.relative_to(PACKAGE).with_suffix("").parts))
+        for name in _REGISTERED.findall(file.read_text(encoding="utf-8")):
+            found.setdefault(name, []).append(module)
+    return found
+
+
+def _follow(module: str, roots: tuple[str, ...], found: dict[str, Path]) -> None:
+    """Add a module and, unless it is installed and foreign, all that it imports to ``found``."""
+    file = _source(module)
+    if module in found or module in NEUTRAL or file is None or not _own(module, file, roots):
+        return
+    found[module] = file
+    if module.partition(".")[0] == "dine":
+        _add_data(file, found)
+    for other in _imported(module, file):
+        _follow(other, roots, found)
+
+
+def _own(module: str, file: Path, roots: tuple[str, ...]) -> bool:
+    """Whether code belongs to ``dine`` or to the user, not to Python or a library."""
+    return module.partition(".")[0] in roots or not str(file).startswith(_INSTALLED)
+
+
+def _add_data(file: Path, found: dict[str, Path]) -> None:
+    """Add the files beside a module, or above it in the package, that it names; templates too."""
+    for name in _DATA.findall(file.read_text(encoding="utf-8")):
+        for folder in file.relative_to(PACKAGE).parents[:-1]:
+            path = PACKAGE / folder / name
+            key = path.relative_to(PACKAGE).as_posix()
+            if path.is_file() and key not in found:
+                found[key] = path
+                _add_data(path, found)
+
+
+@functools.cache
+def _parsed(file: Path) -> ast.Module:
+    return ast.parse(file.read_bytes(), str(file))
+
+
+@functools.cache
+def _imported(module: str, file: Path) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(_imports(_parsed(file).body, module, file.name == "__init__.py")))
+
+
+def _imports(body: list[ast.stmt], module: str, is_package: bool) -> Iterator[str]:
+    """The modules that some statements import, those inside functions among them."""
+    package = module if is_package else module.rpartition(".")[0]
+    waiting: list[ast.AST] = list(body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = _base(node, package)
+            for alias in node.names:
+                yield _defining(base, alias.name)
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            waiting += node.orelse
+        elif isinstance(node, ast.stmt | ast.excepthandler | ast.match_case):
+            waiting += ast.iter_child_nodes(node)
+
+
+def _base(node: ast.ImportFrom, package: str) -> str:
+    """What stands between ``from`` and ``import``, as an absolute name."""
+    if not node.level:
+        return node.module or ""
+    above = package.split(".")[: len(package.split(".")) - node.level + 1]
+    return ".".join([*above, *([node.module] if node.module else [])])
+
+
+def _defining(module: str, name: str) -> str:
+    """Where ``from module import name`` comes from: a package may only pass it on."""
+    if _source(f"{module}.{name}") is not None:
+        return f"{module}.{name}"
+    file = _source(module)
+    if file is not None and file.name == "__init__.py":
+        for node in _parsed(file).body:
+            if isinstance(node, ast.ImportFrom):
+                for alias in node.names:
+                    if (alias.asname or alias.name) == name:
+                        return _defining(_base(node, module), alias.name)
+    return module
+
+
+@functools.cache
+def _source(module: str) -> Path | None:
+    """The Python file of a module, found without importing anything; None if it has none."""
+    top, *below = module.split(".")
+    if top in sys.stdlib_module_names:
+        return None
+    if top == "dine":
+        path = PACKAGE.joinpath(*below)
+        candidates = (path.with_name(f"{path.name}.py"), path / "__init__.py")
+        return next((file for file in candidates if file.is_file()), None)
+    spec, path = None, None
+    for count in range(len(below) + 1):
+        name = ".".join([top, *below[:count]])
+        finders = (f for f in sys.meta_path if hasattr(f, "find_spec"))
+        spec = next((s for f in finders if (s := f.find_spec(name, path))), None)
+        if spec is None or (count < len(below) and spec.submodule_search_locations is None):
+            return None
+        path = spec.submodule_search_locations
+    origin = spec.origin or ""
+    return Path(origin) if origin.endswith(".py") else None
 
 
 def versions() -> dict[str, str]:

@@ -1,6 +1,8 @@
+import json
 from pathlib import Path
 
 import pytest
+from commands import RAW, STAGE1, STAGE2, dine
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -11,3 +13,35 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("../shared (reference meshes and published checkpoint) is not present")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def chain(tmp_path_factory):
+    """One small run of every step."""
+    root = tmp_path_factory.mktemp("run")
+    dine("raw", "--settings", RAW, "--seed", 1, "--out", root)
+    pairs = root / "pairs.h5"
+    split = {"train": 0.5, "val": 0.25, "test": 0.25}
+    dine(
+        *("pairs", "--raw", root / "raw.json", "--out", pairs, "--seed", 1),
+        *("--settings", json.dumps({"points": 64, "convention": "disc", "split": split})),
+    )
+    variant = root / "outliers_25.h5"
+    dine(
+        *("corrupt", "--pairs", pairs, "--condition", "outliers", "--level", 25),
+        *("--out", variant),
+    )
+    dine("stage1", "--pairs", pairs, "--settings", STAGE1, "--out", root / "stage1")
+    model = root / "stage1" / "model.safetensors"
+    dine("fields", "--model", model, "--pairs", pairs, "--out", root / "dvf.h5")
+    for name, arguments in (("pca", {"components": 2}), ("flow", {"steps": 5, "hidden": 8})):
+        dine(
+            *("fit-prior", "--fields", root / "dvf.h5", "--out", root / f"{name}.safetensors"),
+            *("--settings", json.dumps({"kind": name, "arguments": arguments})),
+        )
+    dine(
+        *("search-lambda", "--pairs", pairs, "--model", model, "--out", root / "lambda.json"),
+        *("--prior", "pca", root / "pca.safetensors", "--stage2", STAGE2),
+        *("--settings", '{"candidates": [0.001, 0.1], "steps": 2, "validation_pairs": 1}'),
+    )
+    return root

@@ -2,12 +2,15 @@
 
 import errno
 import os
+import re
 import subprocess
+import sys
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from disks import mounted
 
 from dine.errors import DataError, StorageError
 from dine.files import atomic_path, digest, read_json, write_json, write_text
@@ -36,6 +39,30 @@ def test_the_temporary_file_keeps_the_suffix_and_parents_are_made(tmp_path):
     assert (tmp_path / "new" / "mesh.ply").read_text() == "x"
 
 
+def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path):
+    code = """if True:
+        import os, signal, sys
+        from dine.files import atomic_path
+        with atomic_path(sys.argv[1]) as temporary:
+            temporary.write_text("half of")
+            os.kill(os.getpid(), signal.SIGKILL)
+    """
+    path = tmp_path / "result.ply"
+    subprocess.run([sys.executable, "-c", code, str(path)])
+    (left,) = os.listdir(tmp_path)
+    # What a living process writes stays, and so does what another machine may be writing.
+    number = re.search(r"(\d+)@", left)[1]
+    others = {
+        left.replace(f"{number}@", f"{os.getpid()}@"),
+        left.replace("@", "@other-"),
+        ".result.part.ply",
+    }
+    for name in others:
+        (tmp_path / name).touch()
+    write_text(path, "whole")
+    assert set(os.listdir(tmp_path)) == {"result.ply", *others}
+
+
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])
 def test_storage_errors_name_file_and_cause(tmp_path, code):
     path = tmp_path / "result.txt"
@@ -53,17 +80,8 @@ def test_other_errors_pass_through(tmp_path):
 @pytest.fixture
 def small_disk(tmp_path):
     """A real file system of 64 KiB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(place)]
-    try:
-        done = subprocess.run(mount, capture_output=True)
-    except FileNotFoundError:
-        pytest.skip("mount is not installed")
-    if done.returncode:
-        pytest.skip("mounting a small file system needs root")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
+    with mounted(tmp_path / "disk", "64k") as place:
+        yield place
 
 
 def write_h5(path):

@@ -6,9 +6,9 @@ import pandas as pd
 import pytest
 from samples import POINTS, ball, make_pairs, write_predictions
 
+from dine.data.corruption import make_variant
 from dine.data.pairs import (
     Variant,
-    make_variant,
     read_pairs,
     read_variant_subset,
     write_pairs,

@@ -11,10 +11,10 @@ import trimesh
 
 import dine.data.pairs as module
 import dine.data.prepare as making
+from dine.data.corruption import make_variant
 from dine.data.layout import Inventory, PairFiles
 from dine.data.pairs import (
     PairSet,
-    make_variant,
     read_pairs,
     read_variant,
     write_pairs,

@@ -93,7 +93,8 @@ def test_another_number_of_processes_goes_on_from_the_state(alone, tmp_path, bef
 def test_errors_of_the_processes_are_the_users(tmp_path):
     with pytest.raises(DineError, match="diverged at step 0"):
         run(tmp_path, 2, objective=Objective(Exploding()))
-    with one_writer(tmp_path), pytest.raises(DineError, match=f"in use by process {os.getpid()}"):
+    ours = f"in use by process {os.getpid()}"
+    with one_writer(tmp_path, IDENTITY), pytest.raises(DineError, match=ours):
         run(tmp_path, 2)
 
 

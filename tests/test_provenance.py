@@ -1,61 +1,156 @@
 """Digests that decide what is made again."""
 
+import importlib
 import os
+import re
+import shutil
+import sys
 from importlib import resources
 
+import click
 import pytest
 
-from dine import provenance
-from dine.provenance import LAYERS, PACKAGE, code_digest, folder_signature, versions
+from dine import cli, provenance
+from dine.errors import ConfigError
+from dine.provenance import code_digest, code_files, folder_signature, versions
 
-# Their effect on results goes through settings, or they have none.
-NEUTRAL = {
-    "__init__.py",
-    "__main__.py",
-    "cli.py",
-    "config.py",
-    "errors.py",
-    "files.py",
-    "progress.py",
-    "provenance.py",
-    "registry.py",
-    "results.py",
+
+@pytest.fixture
+def fresh(monkeypatch):
+    """Forget before and after what was found out about code."""
+
+    def forget():
+        for found in (
+            code_digest,
+            code_files,
+            provenance._command,
+            provenance._registered,
+            provenance._parsed,
+            provenance._imported,
+            provenance._source,
+        ):
+            found.cache_clear()
+        importlib.invalidate_caches()
+
+    forget()
+    yield forget
+    monkeypatch.undo()
+    forget()
+
+
+def code_of(*step):
+    return {name.removeprefix("dine.") for name in code_files(*step)}
+
+
+def test_every_command_has_its_code():
+    for name, command in cli.cli.commands.items():
+        if not isinstance(command, click.Group):
+            assert code_files(name), name
+
+
+def test_code_is_found_through_imports():
+    raw, corrupt, train = code_of("raw"), code_of("corrupt"), code_of("stage1")
+    assert {"data.obtain", "data.synthetic", "data.deformation"} <= raw
+    assert corrupt & {"data.corruption", "training.loop"} == {"data.corruption"}
+    assert {"training.loop", "geometry.graph", "models.compiled.messages"} <= train
+    # Templates and tables are code, too.
+    assert "reporting/published_results.csv" in code_of("tables")
+    assert {"reporting/report.html", "reporting/parts.html"} <= code_of("report")
+    assert not {"cli", "config", "files"} & (raw | corrupt | train)
+
+
+def test_only_the_classes_that_are_picked_count():
+    assert not any(name.startswith("priors") for name in code_of("stage1"))
+    fit = code_of("fit-prior", "pca_residual")
+    assert {"priors.pca_residual", "priors.pca", "priors.fitting", "priors.sources"} <= fit
+    assert "priors.flow" not in fit
+    assert "registration.bcpd" in code_of("classical", "bcpd")
+
+
+def test_what_rivals_run_does_not_depend_on_the_networks():
+    assert not any(name.startswith(("models", "training")) for name in code_of("classical", "cpd"))
+
+
+PACKAGE = {
+    "own/__init__.py": "from own.priors import Mine",
+    "own/priors.py": "from .helpers import scale\nfrom dine.geometry import chamfer\nimport beside",
+    "own/helpers.py": "if TYPE_CHECKING:\n    import own.types\n\ndef scale():\n    import numpy",
+    "own/types.py": "",
+    "own/other.py": "from own.helpers import scale",
+    "beside.py": "",
 }
 
 
-def test_every_module_belongs_to_a_layer():
-    entries = {entry for layer in LAYERS.values() for entry in layer}
-    for entry in entries:
-        assert (PACKAGE / entry).exists(), entry
-    for path in PACKAGE.rglob("*.py"):
-        name = path.relative_to(PACKAGE).as_posix()
-        covered = name in entries or name.split("/")[0] in entries
-        assert covered or name in NEUTRAL or name.endswith("__init__.py"), name
+@pytest.fixture
+def own(tmp_path, monkeypatch, fresh):
+    """A user's package on the Python path."""
+    for name, text in PACKAGE.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
 
 
-def test_digest_follows_the_code(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["own.priors:Mine", "own:Mine"])
+@pytest.mark.parametrize(
+    ("edited", "counts"),
+    [
+        ("own/priors.py", True),
+        ("own/helpers.py", True),
+        ("beside.py", True),
+        ("own/types.py", False),
+        ("own/other.py", False),
+    ],
+)
+def test_a_users_own_code_counts_with_what_it_imports(own, fresh, name, edited, counts):
+    before = code_digest("fit-prior", name)
+    assert before != code_digest("fit-prior")
+    assert "dine.geometry.chamfer" in code_files("fit-prior", name)
+    assert not any(module.startswith("numpy") for module in code_files("fit-prior", name))
+    (own / edited).write_text(PACKAGE[edited] + "\n")
+    fresh()
+    assert (code_digest("fit-prior", name) != before) == counts
+    # Nothing of it was run to find that out.
+    assert "own" not in sys.modules
+
+
+@pytest.mark.parametrize("name", ["no_such_module_here:Mine", "own.nothing:Mine", "flwo"])
+def test_classes_that_are_not_there_are_named(own, name):
+    with pytest.raises(ConfigError, match=re.escape(repr(name))):
+        code_digest("fit-prior", name)
+
+
+def test_the_digest_follows_the_code_of_the_package(tmp_path, monkeypatch, fresh):
+    steps = [("stage1", "chamfer"), ("fit-prior", "pca"), ("fit-prior", "flow"), ("tables",)]
     package = tmp_path / "dine"
-    for layer in LAYERS.values():
-        for entry in layer:
-            path = package / entry
-            if path.suffix:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(entry)
-            else:
-                path.mkdir(parents=True, exist_ok=True)
-                (path / "module.py").write_text(entry)
+    shutil.copytree(
+        provenance.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__", "weights")
+    )
     monkeypatch.setattr(provenance, "PACKAGE", package)
 
-    def digests():
-        code_digest.cache_clear()
-        return {layer: code_digest(layer) for layer in LAYERS}
+    def changed_by(name, text):
+        fresh()
+        before = [code_digest(*step) for step in steps]
+        path = package / name
+        path.write_text(text(path.read_text()))
+        fresh()
+        return [step for step in steps if code_digest(*step) != before.pop(0)]
 
-    before = digests()
-    (package / "priors" / "module.py").write_text("changed")
-    (package / "priors" / "notes.txt").write_text("not code")
-    after = digests()
-    code_digest.cache_clear()
-    assert {layer for layer in LAYERS if before[layer] != after[layer]} == {"priors"}
+    def longer(text):
+        return text + "\n"
+
+    assert changed_by("priors/flow.py", longer) == [("fit-prior", "flow")]
+    assert changed_by("training/loop.py", longer) == [("stage1", "chamfer")]
+    assert changed_by("reporting/published_results.csv", longer) == [("tables",)]
+    assert changed_by("files.py", longer) == []
+    # Of the command line, each step has its own command, without the help.
+    assert changed_by("cli.py", lambda text: text.replace("Aggregate metrics", "Sum up")) == []
+    assert changed_by(
+        "cli.py",
+        lambda text: text.replace("made = all_tables(", "made = list(all_tables(").replace(
+            "load_metrics(metrics))", "load_metrics(metrics)))"
+        ),
+    ) == [("tables",)]
 
 
 def test_folder_signature_sees_files_come_go_and_change(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import shutil
 import signal
 import subprocess
@@ -13,63 +14,22 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from click.testing import CliRunner
+from commands import STAGE1, STAGE2, dine
 
 from dine import cli, config
 from dine.data.batch import make_batch
 from dine.data.fields import read_fields
 from dine.data.obtain import obtain
 from dine.data.pairs import read_pairs, read_seen, read_variant, write_pairs
-from dine.errors import CheckpointError, ConfigError, DataError
+from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.evaluation.quality import chamfer
 from dine.files import read_json
+from dine.models.inference import predict_fields
 from dine.priors import load_prior
 from dine.training import stages
 from dine.training.data_terms import DATA_TERMS
-
-STAGE1 = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
-STAGE2 = '{"steps": 2, "validate_every": 2, "validation_pairs": 1}'
-
-
-def dine(*arguments):
-    """Run a command in this process; errors of ours come through as exceptions."""
-    return CliRunner().invoke(cli.cli, list(map(str, arguments)), catch_exceptions=False)
-
-
-@pytest.fixture(scope="module")
-def chain(tmp_path_factory):
-    """One small run of every step."""
-    root = tmp_path_factory.mktemp("run")
-    settings = {
-        "recipe": {"shape": "tissue", "objects": 4, "levels": [0.2, 0.5]},
-        "pairs": {"points": 64},
-    }
-    dine("raw", "--settings", json.dumps(settings), "--seed", 1, "--out", root)
-    pairs = root / "pairs.h5"
-    split = {"train": 0.5, "val": 0.25, "test": 0.25}
-    dine(
-        *("pairs", "--raw", root / "raw.json", "--out", pairs, "--seed", 1),
-        *("--settings", json.dumps({"points": 64, "convention": "disc", "split": split})),
-    )
-    variant = root / "outliers_25.h5"
-    dine(
-        *("corrupt", "--pairs", pairs, "--condition", "outliers", "--level", 25),
-        *("--out", variant),
-    )
-    dine("stage1", "--pairs", pairs, "--settings", STAGE1, "--out", root / "stage1")
-    model = root / "stage1" / "model.safetensors"
-    dine("fields", "--model", model, "--pairs", pairs, "--out", root / "dvf.h5")
-    for name, arguments in (("pca", {"components": 2}), ("flow", {"steps": 5, "hidden": 8})):
-        dine(
-            *("fit-prior", "--fields", root / "dvf.h5", "--out", root / f"{name}.safetensors"),
-            *("--settings", json.dumps({"kind": name, "arguments": arguments})),
-        )
-    dine(
-        *("search-lambda", "--pairs", pairs, "--model", model, "--out", root / "lambda.json"),
-        *("--prior", "pca", root / "pca.safetensors", "--stage2", STAGE2),
-        *("--settings", '{"candidates": [0.001, 0.1], "steps": 2, "validation_pairs": 1}'),
-    )
-    return root
+from dine.training.stage2 import selected_lambda
+from dine.training.state import one_writer
 
 
 def test_stage1_writes_weights_history_and_record(chain):
@@ -88,7 +48,7 @@ def test_fields_are_the_models_own_on_the_training_split(chain):
     stored = read_fields(chain / "dvf.h5")
     train = read_pairs(chain / "pairs.h5", split="train")
     backbone, _ = stages.load_backbone(chain / "stage1" / "model.safetensors")
-    again = stages.predict_fields(backbone, train, name="again", batch_size=1)
+    again = predict_fields(backbone, train, name="again", batch_size=1)
     assert stored.displacement.shape == train.source.shape
     # Batched or alone, and whatever the order of the target's points.
     assert np.abs(stored.displacement - again.displacement).max() < 1e-4
@@ -104,9 +64,9 @@ def test_lambda_is_the_best_candidate_on_validation_pairs(chain):
     assert sorted(curve["lambda"]) == [0, 0.001, 0.1]
     tried = curve[curve["lambda"] > 0]
     assert result["selected"]["pca"] == tried.loc[tried["cd"].idxmin(), "lambda"]
-    assert stages.selected_lambda(chain / "lambda.json", "pca") == result["selected"]["pca"]
+    assert selected_lambda(chain / "lambda.json", "pca") == result["selected"]["pca"]
     # A prior without a search of its own takes the default's.
-    assert stages.selected_lambda(chain / "lambda.json", "flow") == result["selected"]["pca"]
+    assert selected_lambda(chain / "lambda.json", "flow") == result["selected"]["pca"]
 
 
 def run_stage2(chain, out, *arguments):
@@ -156,20 +116,27 @@ def test_precision_is_recorded_and_part_of_the_identity(chain, tmp_path):
     assert 0 < np.abs(reduced - exact).max() < 0.5
 
 
-def start_training(chain, out, processes):
-    """The command of a training, and its process as soon as a state of it has been saved."""
-    settings = json.loads(STAGE1) | {"steps": 40, "batch_size": 2, "save_seconds": 0.001}
+def training_command(chain, out, steps=40, processes=1):
+    settings = json.loads(STAGE1) | {"steps": steps, "batch_size": 2, "save_seconds": 0.001}
     settings["validate_every"] = settings["steps"]
-    command = [
+    return [
         *(sys.executable, "-m", "dine", "--threads", "1", "stage1", "--out", out),
         *("--pairs", chain / "pairs.h5", "--settings", json.dumps(settings)),
         *("--device", "cpu", "--processes", str(processes)),
     ]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    history = out / "training" / "history.csv"
-    give_up = time.monotonic() + 60
-    while not history.exists() and time.monotonic() < give_up:
+
+
+def wait_for(path, there=True):
+    give_up = time.monotonic() + 300
+    while path.exists() != there and time.monotonic() < give_up:
         time.sleep(0.01)
+
+
+def start_training(chain, out, processes):
+    """A training that has saved its state at least once, as a process, and its command."""
+    command = training_command(chain, out, processes=processes)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    wait_for(out / "training" / "history.csv")
     return command, process
 
 
@@ -193,7 +160,7 @@ def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, 
 
 def test_one_of_several_processes_dies(chain, tmp_path):
     command, process = start_training(chain, tmp_path, 2)
-    leader = int((tmp_path / "training" / "holder.txt").read_text().split()[-1])
+    leader = int((tmp_path / "training" / "holder.txt").read_text().split()[1])
     assert leader != process.pid
     os.kill(leader, signal.SIGKILL)
     error = process.communicate(timeout=60)[1]
@@ -201,6 +168,51 @@ def test_one_of_several_processes_dies(chain, tmp_path):
     assert "Process 1 of 2 died (SIGKILL); run the same command again" in error
     again = subprocess.run(command, check=True, stderr=subprocess.PIPE, text=True)
     assert "going on from step" in again.stderr
+
+
+def test_an_orphan_holds_its_folder_until_it_ends(chain, tmp_path):
+    out = tmp_path / "run"
+    command = training_command(chain, out, steps=10**6)
+    parent = [sys.executable, "-c", "import subprocess, sys; subprocess.run(sys.argv[1:])"]
+    started = subprocess.Popen([*parent, *command], stderr=subprocess.DEVNULL)
+    wait_for(out / "training" / "state.pt")
+    started.kill()  # as Snakemake may be; its training does not notice
+    started.wait()
+    holder = out / "training" / "holder.txt"
+    number = int(holder.read_text().split()[1])
+    try:
+        refused = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+        assert refused.returncode == 1
+        assert f"is in use by process {number} on {platform.node()}; wait for it" in refused.stderr
+    finally:
+        os.kill(number, signal.SIGTERM)
+    wait_for(holder, there=False)
+    state = torch.load(out / "training" / "state.pt", weights_only=True)
+    assert len(state["history"]) == state["step"]
+    again = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    wait_for(holder)
+    again.terminate()
+    assert f"going on from step {state['step']}" in again.communicate(timeout=60)[1]
+
+
+def test_results_that_are_no_longer_asked_for_are_not_written(chain, tmp_path, monkeypatch):
+    command = ("stage1", "--pairs", chain / "pairs.h5", "--out", tmp_path, "--settings")
+    train = stages.train
+
+    def disturbed(*arguments, **keywords):
+        history = train(*arguments, **keywords)
+        monkeypatch.setattr(stages, "train", train)
+        with one_writer(keywords["folder"], {}), pytest.raises(DineError, match="is in use by"):
+            dine(*command, json.dumps(json.loads(STAGE1) | {"steps": 4}))
+        return history
+
+    monkeypatch.setattr(stages, "train", disturbed)
+    with pytest.raises(DineError, match="asked for with other settings while it ran; nothing is"):
+        dine(*command, STAGE1)
+    assert not (tmp_path / "model.safetensors").exists()
+    dine(*command, STAGE1)
+    same = (chain / "stage1" / "model.safetensors").read_bytes()
+    assert (tmp_path / "model.safetensors").read_bytes() == same
 
 
 def test_predictions_and_metrics(chain, tmp_path):
@@ -266,9 +278,9 @@ def test_truncated_inputs_are_named(chain, tmp_path):
     with pytest.raises(CheckpointError, match=r"pca\.safetensors"):
         load_prior(damaged(chain / "pca.safetensors", tmp_path))
     with pytest.raises(DataError, match=r"lambda\.json"):
-        stages.selected_lambda(damaged(chain / "lambda.json", tmp_path), "pca")
+        selected_lambda(damaged(chain / "lambda.json", tmp_path), "pca")
     with pytest.raises(DataError, match=r"not the result of `dine search-lambda`"):
-        stages.selected_lambda(chain / "raw.json", "pca")
+        selected_lambda(chain / "raw.json", "pca")
     assert not (tmp_path / "x").exists()
     assert not (tmp_path / "x.h5").exists()
 
@@ -385,7 +397,8 @@ def test_a_folder_of_undeformed_meshes_becomes_a_dataset(chain, tmp_path):
 def test_a_folder_in_the_published_layout_is_used_as_it_is(chain, tmp_path):
     dataset = config.Dataset(source={"kind": "path", "folder": str(chain / "raw")})
     obtain(dataset, tmp_path, seed=0)
-    assert read_json(tmp_path / "raw.json") == {"folder": str(chain / "raw"), "origin": "path"}
+    facts = read_json(tmp_path / "raw.json")
+    assert (facts["folder"], facts["origin"]) == (str(chain / "raw"), "path")
     listed = dine("inspect", chain / "raw").output
     assert "deformation" in listed
     assert "0.5" in listed

@@ -14,11 +14,11 @@ from dine.data.loading import Batches
 from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
 from dine.models.backbones import Backbone, Registration
+from dine.models.inference import chosen_device
 from dine.priors import PRIORS
 from dine.training import loop
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
-from dine.training.parallel import chosen_device
 from dine.training.stages import new_backbone
 from dine.training.state import Interrupted, one_writer
 
@@ -85,6 +85,13 @@ class Shift(Backbone):
         return Registration(self.shift.expand_as(batch.source), None, None)
 
 
+class Noisy(Shift):
+    """Draws from torch's own generator, as dropout does."""
+
+    def forward(self, batch):
+        return Registration(self.shift + 0.1 * torch.randn(batch.source.shape), None, None)
+
+
 class Killed(BaseException):
     pass
 
@@ -105,6 +112,37 @@ def test_a_killed_run_ends_where_an_undisturbed_one_does(tmp_path, at):
     assert without_time(resumed) == without_time(history)
     # Work done before the last save is not done again.
     assert len(steps) == 6 - at
+
+
+def test_a_backbone_that_draws_random_numbers_is_resumed_bit_for_bit(tmp_path):
+    def shift(folder, at=None):
+        def kill(step):
+            if step == at:
+                raise Killed
+
+        before = torch.random.get_rng_state()
+        backbone = Noisy()
+        loop.train(
+            backbone,
+            Objective(DATA_TERMS.get("chamfer")()),
+            toy_pairs(),
+            toy_pairs(1),
+            SETTINGS,
+            seed=0,
+            folder=folder,
+            identity=IDENTITY,
+            name="toy",
+            device="cpu",
+            on_step=kill,
+        )
+        assert torch.equal(torch.random.get_rng_state(), before)
+        return backbone.shift.tolist()
+
+    expected = shift(tmp_path / "whole")
+    with pytest.raises(Killed):
+        shift(tmp_path / "killed", at=2)
+    torch.rand(5)
+    assert shift(tmp_path / "killed") == expected
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -156,7 +194,7 @@ def test_a_second_writer_is_refused(tmp_path):
     release, held = threading.Event(), threading.Event()
 
     def hold():
-        with one_writer(tmp_path):
+        with one_writer(tmp_path, IDENTITY):
             held.set()
             release.wait(10)
 

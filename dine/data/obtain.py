@@ -12,8 +12,9 @@ from dine.config import Dataset
 from dine.data.layout import Inventory, scan
 from dine.data.raw import deform_bases, synthesise
 from dine.errors import DataError
-from dine.files import atomic_path, read_json, write_json
+from dine.files import atomic_path, digest, file_digest, read_json, write_json
 from dine.progress import LOG_SECONDS
+from dine.provenance import folder_signature
 
 log = logging.getLogger(__name__)
 
@@ -24,7 +25,7 @@ SYNTHETIC, BASES, PATH, DOI = "synthetic", "bases", "path", "doi"
 def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) -> None:
     """Make or find a dataset's raw files.
 
-    Writes into ``folder``: ``raw.json`` (where the files are and how they came about),
+    Writes into ``folder``: ``raw.json`` (where the files are, how they came about and a digest),
     ``inventory.csv`` (pairs and objects per condition and level), ``left_out.csv`` (every file that
     is not used, and why), and, where files are made or downloaded, ``raw/`` with them.
 
@@ -65,7 +66,15 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
             "(Deformation_Level/<level>/Source_… and Target_…), or a manifest (CSV)."
         )
     report(inventory, folder)
-    write_json(folder / "raw.json", {"folder": str(place), "origin": origin})
+    # Other meshes give another file, so that what was made of the old ones is made again even where
+    # the run was killed right after this.
+    if origin == PATH:
+        content = folder_signature(place)
+    elif origin == DOI:
+        content = digest(source.model_dump())
+    else:
+        content = file_digest(made / "provenance.json")
+    write_json(folder / "raw.json", {"folder": str(place), "origin": origin, "content": content})
 
 
 class _Download:

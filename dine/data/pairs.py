@@ -50,7 +50,6 @@ import numpy as np
 import scipy
 
 from dine import __version__
-from dine.data.corruption import add_outliers, gaussian_noise
 from dine.data.sampling import SurfaceSamples
 from dine.errors import ConfigError, DataError
 from dine.files import atomic_path, digest
@@ -266,41 +265,6 @@ class Variant:
 
     def __len__(self) -> int:
         return len(self.target)
-
-
-def make_variant(pairs: PairSet, condition: str, level: float, seed: int) -> Variant:
-    """Corrupt the targets of pairs.
-
-    The draw of a pair is keyed by seed, its name, condition and level, so it is the same whichever
-    other pairs there are.
-
-    Args:
-        pairs: at least one pair.
-        condition: ``noise`` or ``outliers``.
-        level: standard deviation in the normalised frame, or percent of outliers; > 0.
-        seed: >= 0.
-
-    Raises:
-        ConfigError: unknown condition, or an unusable level.
-        DataError: no pairs.
-    """
-    if condition not in ("noise", "outliers"):
-        raise ConfigError(f"Unknown condition {condition!r}; expected noise or outliers.")
-    if level is None or not level > 0:
-        raise ConfigError(f"The level of {condition} must be above 0, found {level!r}.")
-    if len(pairs) == 0:
-        raise DataError(f"There are no pairs to add {condition} to.")
-    targets, inliers = [], []
-    for name, target in zip(pairs.name, pairs.target, strict=True):
-        rng = keyed_rng(seed, str(name), condition, float(level))
-        if condition == "noise":
-            targets.append(gaussian_noise(target, level, rng))
-            inliers.append(np.ones(len(target), dtype=bool))
-        else:
-            corrupted, inlier = add_outliers(target, level, rng)
-            targets.append(corrupted)
-            inliers.append(inlier)
-    return Variant(condition, float(level), np.stack(targets), np.stack(inliers), pairs.name)
 
 
 def write_variant(path: str | os.PathLike, variant: Variant, pairs_digest: str) -> None:

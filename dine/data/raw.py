@@ -35,6 +35,7 @@ from dine.data.surface import Surface
 from dine.data.synthetic import primitive, tissue_patch
 from dine.errors import DataError, StorageError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
+from dine.provenance import code_digest
 
 logger = logging.getLogger(__name__)
 
@@ -200,6 +201,7 @@ def _write(
     key = {
         "made_by": _MAKER,
         "dine_version": __version__,
+        "code": code_digest("raw"),
         "origin": origin,
         "parameters": parameters,
         "bases": identity,

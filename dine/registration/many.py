@@ -15,6 +15,7 @@ from dine.data.manifest import read_manifest
 from dine.errors import DataError, DineError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json
 from dine.progress import Progress
+from dine.provenance import code_digest
 from dine.registration.output import Outputs, save
 from dine.registration.register import Model, RegistrationResult, register
 
@@ -124,6 +125,7 @@ def _one(
             "target": file_digest(job.target),
             "weights": file_digest(model.weights),
             "prior": model.prior_path and file_digest(model.prior_path),
+            "code": code_digest("register-many", *_classes(model)),
             "settings": {k: str(v) for k, v in settings.items()},
             "suffix": suffix,
             "view": view,
@@ -143,6 +145,10 @@ def _one(
     row = _row(result)
     write_json(mark, {"identity": identity, "row": row})
     return row
+
+
+def _classes(model: Model) -> list[str]:
+    return [part.registered_name for part in (model.backbone, model.prior) if part is not None]
 
 
 def _row(result: RegistrationResult) -> dict:

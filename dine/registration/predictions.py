@@ -1,51 +1,26 @@
-"""Test pairs registered without a network, or refined from a network's stored predictions."""
+"""Test pairs refined from a network's stored predictions."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dine.config import RefinedMethod
 from dine.errors import ConfigError, DataError
-from dine.evaluation.predict import Condition, each_pair, evaluation_conditions, write_predictions
+from dine.evaluation.conditions import (
+    Condition,
+    each_pair,
+    evaluation_conditions,
+    prediction,
+    write_predictions,
+)
 from dine.evaluation.predictions import Prediction, read_predictions
 from dine.files import file_digest
 from dine.priors import Prior, load_prior
-from dine.registration.classical import CLASSICAL
 from dine.registration.descent import descend
 from dine.registration.refine import expected_error, refine
 from dine.training.data_terms import DATA_TERMS
-
-
-def classical_predictions(
-    pairs_path: Path,
-    variants: list[Path],
-    out: Path,
-    *,
-    algorithm: str,
-    arguments: dict[str, Any],
-    name: str,
-) -> None:
-    """Register the test split and its variants with a classical method, and write all fields.
-
-    Raises:
-        ConfigError: unknown method or arguments.
-    """
-    try:
-        method = CLASSICAL.get(algorithm)(**arguments)
-    except TypeError as error:
-        raise ConfigError(
-            f"The method {algorithm!r} does not take these arguments: {error}."
-        ) from None
-
-    def fields(condition: Condition) -> Prediction:
-        found, seconds = each_pair(condition, name, lambda _, *clouds: method(*clouds))
-        return _prediction(condition, found, seconds)
-
-    facts = {"pairs": file_digest(pairs_path), "name": name}
-    write_predictions(out, evaluation_conditions(pairs_path, variants), fields, **facts)
 
 
 def refine_predictions(
@@ -85,7 +60,7 @@ def refine_predictions(
         found, seconds = each_pair(condition, name, register)
         if start.seconds is not None:
             seconds = seconds + start.seconds
-        return _prediction(condition, found, seconds)
+        return prediction(condition, found, seconds)
 
     facts = {"predictions": file_digest(predictions), "pairs": file_digest(pairs_path)}
     conditions = evaluation_conditions(pairs_path, variants)
@@ -122,10 +97,4 @@ def _refined(
         expected_error(spread, len(source)),
         prior=prior and prior.gaussian(source),
         **settings.arguments,
-    )
-
-
-def _prediction(condition: Condition, fields: np.ndarray, seconds: np.ndarray) -> Prediction:
-    return Prediction(
-        condition.name, condition.corruption, condition.pairs.name, fields, None, seconds
     )

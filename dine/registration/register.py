@@ -20,6 +20,7 @@ from dine.errors import ConfigError, DataError
 from dine.evaluation.quality import distances, fit, folding, landmark_errors
 from dine.files import file_digest
 from dine.models.checkpoint import load_backbone
+from dine.models.inference import chosen_device
 from dine.priors import load_prior
 from dine.registration.calibration import (
     Calibration,
@@ -31,7 +32,6 @@ from dine.registration.carry import carry
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
 from dine.registration.refine import ROUNDS, refine
 from dine.registration.trust import Trust, assess
-from dine.training.parallel import chosen_device
 from dine.training.stages import WEIGHTS, shipped_weights
 
 log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""Figures and the report of a finished run, from the files in its results folder."""
+"""Figures of a finished run, from the files in its results folder."""
 
 from __future__ import annotations
 
@@ -9,21 +9,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from dine.config import STAGE1, Config
+from dine.config import Config
 from dine.data.pairs import read_pairs
 from dine.files import read_json
 from dine.priors import PCAPrior, load_prior
-from dine.provenance import versions
 from dine.reporting import figures as draw
-from dine.reporting.html import ReportFigure, write_report
-from dine.reporting.tables import all_tables, display_name, load_metrics, origin_of
+from dine.reporting.tables import display_name, load_metrics, origin_of
 from dine.results import CLEAN, Results, conditions, figure_names, pca_priors, runs
 
 HISTORY_WINDOW = 20
 """Steps over which training curves are averaged, since a step sees few pairs."""
 
 
-class _Run:
+class Run:
     """Reads a run's files and draws its figures by name."""
 
     def __init__(self, results: Path, config: Config):
@@ -158,42 +156,5 @@ class _Run:
 
 def draw_figures(results: Path, config: Config, out: Path) -> None:
     """Draw every figure of a run as PNG and PDF into ``out``."""
-    for name, (_, _, make) in _Run(results, config).all_figures().items():
+    for name, (_, _, make) in Run(results, config).all_figures().items():
         draw.save_figure(make(), out / name)
-
-
-def build_report(results: Path, config: Config, out: Path) -> None:
-    """Write the HTML report of a run whose figures are drawn."""
-    run = _Run(results, config)
-    agreement = pd.DataFrame(
-        {"dataset": display_name(dataset)} | read_json(run.files.dataset(dataset, "agreement.json"))
-        for dataset in config.datasets
-    )
-    seconds = {}
-    for dataset, backbone, method in runs(config):
-        record = read_json(run.files.run(dataset, backbone, method, "run.json"))
-        stage = "Stage 1" if method == STAGE1 else "Stage 2"
-        label = (
-            f"{stage}, {display_name(dataset)}, {display_name(backbone)}, {display_name(method)}"
-        )
-        seconds[label] = record["training_seconds"]
-    links = {"All tables (Markdown)": "tables/all.md", "Resolved configuration": "config.yaml"}
-    for dataset in config.datasets:
-        links[f"{display_name(dataset)}: files found"] = f"{dataset}/inventory.csv"
-        links[f"{display_name(dataset)}: files left out"] = f"{dataset}/left_out.csv"
-        links[f"{display_name(dataset)}: pairs"] = f"{dataset}/pairs.h5"
-    write_report(
-        out,
-        run.metrics,
-        all_tables(run.metrics),
-        [
-            ReportFigure(section, caption, results / "figures" / f"{name}.png")
-            for name, (section, caption, _) in run.all_figures().items()
-        ],
-        index_agreement=agreement,
-        lambda_searches=[read_json(run.files.search)],
-        config=config.model_dump(mode="json"),
-        versions=versions(),
-        step_seconds=seconds,
-        files=links,
-    )

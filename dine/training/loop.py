@@ -28,9 +28,10 @@ from dine.evaluation.quality import roughness
 from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import Backbone
+from dine.models.inference import chosen_device
 from dine.progress import Progress
 from dine.training.objective import Loss, Objective
-from dine.training.parallel import Alone, Team, chosen_device, run_together
+from dine.training.parallel import Alone, Team, run_together
 from dine.training.state import Interrupted, StopRequest, load_state, one_writer, save_state
 
 log = logging.getLogger(__name__)
@@ -47,6 +48,12 @@ def order_of(step: int, batch_size: int, count: int, seed: int) -> np.ndarray:
     epochs = positions // count
     orders = {e: np.random.default_rng([seed, 0, e]).permutation(count) for e in np.unique(epochs)}
     return np.array([orders[e][p] for e, p in zip(epochs, positions % count, strict=True)])
+
+
+def seed_torch(seed: int, step: int, rank: int) -> None:
+    """Seed what a backbone may draw in a step, such as dropout."""
+    state = np.random.SeedSequence([seed, 3, step, rank]).generate_state(1, np.uint64)
+    torch.manual_seed(int(state[0]))
 
 
 def share_of(team: Team, step: int, batch_size: int, count: int, seed: int) -> Request:
@@ -207,7 +214,7 @@ def _train(
     batches = Batches(train_pairs, team.device, train_targets, settings.parts)
     val_batches = Batches(val_pairs, team.device, val_targets)
     path = folder / STATE
-    with one_writer(folder) if team.leads else contextlib.nullcontext():
+    with one_writer(folder, identity) if team.leads else contextlib.nullcontext():
         team.wait()  # until the folder is ours
         state, message = load_state(path, identity)
         log.info("%s: %s", name, message)
@@ -239,10 +246,12 @@ def _train(
             share_of(team, step, settings.batch_size, len(batches), seed) for step in steps
         )
         with (
+            torch.random.fork_rng(devices=[]),
             contextlib.closing(stream),
             Progress(name, settings.steps, start, quiet=not team.leads) as progress,
         ):
             for step, (batch, truth) in zip(steps, stream, strict=True):
+                seed_torch(seed, step, team.rank)
                 rate = learning_rate(settings, step)
                 for group in optimiser.param_groups:
                     group["lr"] = rate

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
 
 from dine.data.batch import Batch
 from dine.models.backbones import Backbone
-from dine.priors.base import Prior
 from dine.training.data_terms import DataTerm
+
+if TYPE_CHECKING:  # Stage 1 has no prior, and is not made again when one changes
+    from dine.priors.base import Prior
 
 
 @dataclass(frozen=True)

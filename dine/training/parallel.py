@@ -32,19 +32,6 @@ GRACE_SECONDS = 5.0
 """How long the others may take to notice that one process has died, before they are ended."""
 
 
-def chosen_device(name: str) -> torch.device:
-    """``auto``, ``cpu`` or ``cuda`` as a device.
-
-    Raises:
-        DineError: ``cuda`` where there is none.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise DineError("The device 'cuda' was asked for, but no CUDA device is available here.")
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
-
-
 class Alone:
     """A training in this process; ``torch.distributed`` is not touched."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import platform
 import signal
 import threading
 from collections.abc import Iterator
@@ -15,38 +16,69 @@ import filelock
 import torch
 
 from dine.errors import DineError
-from dine.files import atomic_path
+from dine.files import atomic_path, read_json, storage_errors, write_json
 
 
 class Interrupted(DineError):
     """The run was asked to stop; its state is saved."""
 
 
+ASKED = "asked.json"
+
+
 @contextlib.contextmanager
-def one_writer(folder: Path) -> Iterator[None]:
+def one_writer(folder: Path, identity: dict[str, str]) -> Iterator[None]:
     """Hold a run folder; a second process that wants it is refused.
 
-    The operating system lets go of the lock when the holder dies, however it dies.
+    The operating system lets go of the lock when the holder dies, however it dies. One that was
+    refused leaves its ``identity`` behind, for :func:`check_still_wanted`.
 
     Raises:
         DineError: another process is training in the folder.
+        StorageError: the folder cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     holder = folder / "holder.txt"
     lock = filelock.FileLock(folder / "lock", timeout=0)
     try:
-        lock.acquire()
+        with storage_errors(folder):
+            lock.acquire()
     except filelock.Timeout:
-        who = holder.read_text().strip() if holder.exists() else "another process"
+        write_json(folder / ASKED, identity)
+        who = holder.read_text().strip() if holder.exists() else ""
         raise DineError(
-            f"{folder} is in use by {who}; wait for it or stop it, then run the same command again."
+            f"{folder} is in use by {who or 'another process'}; wait for it or stop it, then run "
+            "the same command again."
         ) from None
     try:
-        holder.write_text(f"process {os.getpid()}\n")
+        with storage_errors(folder):
+            (folder / ASKED).unlink(missing_ok=True)
+            holder.write_text(f"process {os.getpid()} on {platform.node()}\n")
         yield
     finally:
         holder.unlink(missing_ok=True)
         lock.release()
+
+
+def check_still_wanted(folder: Path, identity: dict[str, str], name: str) -> None:
+    """Refuse to finish a training that, while it ran, was asked for with something else.
+
+    Its results would take the place of those that were asked for, and look newer.
+
+    Raises:
+        DineError: what was refused meanwhile has another identity.
+    """
+    asked = folder / ASKED
+    if not asked.exists():
+        return
+    wanted = read_json(asked)
+    changed = [key for key in identity if wanted.get(key) != identity[key]]
+    if changed:
+        raise DineError(
+            f"{name} is finished, but was asked for with other {', '.join(changed)} while it ran; "
+            "nothing is written. Run the command with the new settings again."
+        )
 
 
 class StopRequest:

@@ -80,6 +80,14 @@ def section(model):
     return json.dumps(model.model_dump(mode="json", exclude_none=True), sort_keys=True)
 
 
+def drawn_settings():
+    """What the figures need to know; other settings reach them through files, or not at all."""
+    drawn = {"datasets", "backbones", "priors", "lambda_search"}
+    return json.dumps(
+        CONFIG.model_dump(mode="json", exclude_none=True, include=drawn), sort_keys=True
+    )
+
+
 def options(flag, *columns):
     """A repeated command-line option, quoted for the shell: one for each row of the columns."""
     return " ".join(shlex.join([flag, *map(str, row)]) for row in zip(*columns))
@@ -123,6 +131,20 @@ def training_seed(wildcards):
     return backbone_and_seed(CONFIG, wildcards.backbone)[1]
 
 
+def code_of(step, backbone=None, *, data_term=None, priors=()):
+    """Digest of the code behind a step, and of what the configuration picks for it by name.
+
+    A backbone and priors are named as in the configuration, or as a folder is.
+    """
+    picked = [CONFIG.priors[prior].kind for prior in priors]
+    if backbone:
+        name, _ = backbone_and_seed(CONFIG, backbone)
+        picked.append(CONFIG.every_backbone[name].kind)
+    if data_term:
+        picked.append(data_term)
+    return code_digest(step, *picked)
+
+
 def stage1_settings(wildcards):
     start = backbone_config(wildcards).start
     changes = {"start": start} if start else {}
@@ -161,13 +183,16 @@ def variant_options(wildcards, input):
     return options("--variant", input.variants)
 
 
-def calibrating_prior(wildcards):
+def calibrating_priors(wildcards):
     """The backbone's first PCA prior, if any: what the trust score measures fields with."""
+    name, _ = backbone_and_seed(CONFIG, wildcards.backbone)
+    return pca_priors(CONFIG, name)[:1]
+
+
+def calibrating_prior(wildcards):
     return [
         FILES.prior(wildcards.dataset, wildcards.backbone, prior)
-        for prior in pca_priors(
-            CONFIG, backbone_and_seed(CONFIG, wildcards.backbone)[0]
-        )[:1]
+        for prior in calibrating_priors(wildcards)
     ]
 
 
@@ -238,6 +263,26 @@ def searched_prior(wildcards):
     return FILES.prior(search.dataset, search.backbone, prior)
 
 
+def method_code(wildcards):
+    method = CONFIG.evidence.methods[wildcards.trained]
+    return code_of(
+        "stage2",
+        wildcards.backbone,
+        data_term=method.data_term,
+        priors=[method.prior] if method.prior else [],
+    )
+
+
+def searched_code(wildcards):
+    method = CONFIG.evidence.methods[wildcards.trained]
+    return code_of(
+        "search-lambda",
+        CONFIG.lambda_search.backbone,
+        data_term=method.data_term,
+        priors=[method.prior],
+    )
+
+
 def method_inputs(wildcards):
     """The prior of a Stage-2 method, and the search of its λ unless that is given."""
     method = CONFIG.evidence.methods[wildcards.trained]
@@ -270,6 +315,15 @@ def evidence_search(wildcards):
     choice = CONFIG.evidence.choice.model_dump()
     return json.dumps(
         {**named, **choice, "priors": [wildcards.trained]}, sort_keys=True
+    )
+
+
+def refined_code(wildcards):
+    method = CONFIG.evidence.methods[wildcards.refined]
+    return code_of(
+        "refine-predictions",
+        data_term=method.data_term,
+        priors=[method.prior] if method.prior else [],
     )
 
 

@@ -55,7 +55,7 @@ rule agreement:
         "../envs/dine.yaml"
     params:
         seed=CONFIG.seed,
-        code=code_digest("pairs"),
+        code=code_digest("agreement"),
     shell:
         "dine --log {log:q} agreement --pairs {input:q} --seed {params.seed} --out {output:q}"
 

@@ -21,7 +21,7 @@ rule predict:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=code_digest("model", "evaluation"),
+        code=lambda wildcards: code_of("predict", wildcards.backbone),
     shell:
         "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
         " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
@@ -47,7 +47,7 @@ rule evaluate:
         variants=variant_options,
         method=lambda wildcards: wildcards.run.removeprefix("stage2/"),
         seed=CONFIG.seed,
-        code=code_digest("evaluation"),
+        code=code_digest("evaluate"),
     shell:
         "dine --log {log:q} evaluate --predictions {input.predictions:q} --pairs {input.pairs:q}"
         " {params.variants} --dataset {wildcards.dataset} --backbone {wildcards.backbone}"

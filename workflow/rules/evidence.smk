@@ -93,7 +93,7 @@ rule evidence_resample:
     params:
         levels=evidence_levels,
         seed=CONFIG.seed,
-        code=code_digest("pairs"),
+        code=code_digest("resample"),
     shell:
         "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
         " {params.levels} --seed {params.seed} --out {output:q}"
@@ -123,7 +123,7 @@ rule evidence_lambda:
         settings=evidence_search,
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=code_digest("model", "priors", "training"),
+        code=searched_code,
     shell:
         "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
         " --model {input.model:q} --prior {wildcards.trained} {input.prior:q}"
@@ -153,7 +153,7 @@ rule stage2_method:
         settings=method_stage2,
         seed=training_seed,
         compute=COMPUTE,
-        code=code_digest("model", "priors", "training"),
+        code=method_code,
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --variant {wildcards.trained} {params.prior}"
@@ -190,7 +190,7 @@ rule evidence_predict:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=code_digest("model", "evaluation"),
+        code=lambda wildcards: code_of("predict", wildcards.cell_backbone),
     shell:
         "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
         " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
@@ -223,7 +223,7 @@ rule evidence_refine:
         variants=variant_options,
         prior=refined_prior_options,
         settings=lambda wildcards: section(CONFIG.evidence.methods[wildcards.refined]),
-        code=code_digest("priors", "training", "evaluation", "registration"),
+        code=refined_code,
     shell:
         "dine --log {log:q} --threads {threads} refine-predictions"
         " --predictions {input.predictions:q} --pairs {input.pairs:q} {params.variants}"
@@ -250,7 +250,9 @@ rule evidence_classical:
         arguments=lambda wildcards: json.dumps(
             CONFIG.evidence.methods[wildcards.classical].arguments, sort_keys=True
         ),
-        code=code_digest("evaluation", "registration"),
+        code=lambda wildcards: code_digest(
+            "classical", CONFIG.evidence.methods[wildcards.classical].algorithm
+        ),
     shell:
         "dine --log {log:q} --threads {threads} classical --pairs {input.pairs:q}"
         " {params.variants} --algorithm {params.algorithm:q} --arguments {params.arguments:q}"
@@ -276,7 +278,7 @@ rule evidence_evaluate:
         runs=lambda wildcards, input: cell_options(
             group_cells(wildcards), input.predictions
         ),
-        code=code_digest("evaluation"),
+        code=code_digest("evaluate"),
     shell:
         "dine --log {log:q} evaluate {params.runs} --pairs {input.pairs:q}"
         " {params.variants} --dataset {wildcards.dataset} --backbone {wildcards.group}"
@@ -298,7 +300,7 @@ rule evidence_diagnose:
         "../envs/dine.yaml"
     params:
         seed=CONFIG.seed,
-        code=code_digest("priors", "reporting"),
+        code=lambda wildcards: code_of("diagnose", priors=[wildcards.prior]),
     shell:
         "dine --log {log:q} diagnose --prior {input.prior:q} --fields {input.fields:q}"
         " --pairs {input.pairs:q} --dataset {wildcards.dataset} --backbone {wildcards.backbone}"
@@ -323,7 +325,7 @@ rule evidence_examples:
             example_cells(wildcards), input.predictions
         ),
         methods=evidence_method_texts(),
-        code=code_digest("reporting"),
+        code=code_digest("examples"),
     shell:
         "dine --log {log:q} examples {params.runs} --pairs {input.pairs:q} {params.variants}"
         " --methods {params.methods:q} --dataset {wildcards.dataset} --out {output.views:q}"
@@ -351,7 +353,7 @@ rule evidence:
         examples=evidence_example_options,
         methods=evidence_method_texts(),
         settings=section(CONFIG),
-        code=code_digest("reporting", "evaluation"),
+        code=code_digest("evidence"),
     shell:
         "dine --log {log:q} evidence {input.metrics:q} {params.searches} {params.diagnostics}"
         " {params.examples}"

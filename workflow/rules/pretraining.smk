@@ -75,7 +75,7 @@ rule pretraining_targets:
         "../envs/dine.yaml"
     params:
         seed=CONFIG.seed,
-        code=code_digest("pairs"),
+        code=code_digest("resample"),
     shell:
         "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
         " --seed {params.seed} --out {output:q}"
@@ -106,7 +106,9 @@ rule pretrain:
         settings=section(CONFIG.pretraining),
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=code_digest("model", "training"),
+        code=lambda wildcards: code_of(
+            "pretrain", wildcards.backbone, data_term=CONFIG.pretraining.data_term
+        ),
     shell:
         "dine --log {log:q} --threads {threads} pretrain {params.pairs}"
         " {params.targets}"
@@ -133,7 +135,7 @@ rule pretraining_fields:
         gpu=GPUS,
     params:
         compute=COMPUTE,
-        code=code_digest("model"),
+        code=lambda wildcards: code_of("fields", wildcards.backbone),
     shell:
         "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
         " --pairs {input.pairs:q} --targets {input.targets:q} {params.compute}"
@@ -158,7 +160,7 @@ rule pretraining_prior:
         fields=lambda wildcards, input: options("--fields", input),
         settings=json.dumps({"kind": "pca"}),
         seed=CONFIG.seed,
-        code=code_digest("priors"),
+        code=code_digest("fit-prior", "pca"),
     shell:
         "dine --log {log:q} --threads {threads} fit-prior {params.fields}"
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
@@ -184,7 +186,9 @@ rule pretraining_calibration:
         pairs=lambda wildcards, input: options("--pairs", input.pairs),
         targets=lambda wildcards, input: options("--targets", input.targets),
         device=CONFIG.device,
-        code=code_digest("model", "priors", "calibration"),
+        code=lambda wildcards: code_digest(
+            "calibrate", backbone_config(wildcards).kind, "pca"
+        ),
     shell:
         "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
         " {params.pairs} {params.targets} --prior {input.prior:q} --device {params.device}"

@@ -17,7 +17,7 @@ rule fit_prior:
     params:
         settings=prior_settings,
         seed=training_seed,
-        code=code_digest("priors"),
+        code=lambda wildcards: code_of("fit-prior", priors=[wildcards.prior]),
     shell:
         "dine --log {log:q} --threads {threads} fit-prior --fields {input:q}"
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
@@ -53,7 +53,12 @@ rule search_lambda:
         settings=section(SEARCH),
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=code_digest("model", "priors", "training"),
+        code=code_of(
+            "search-lambda",
+            SEARCH.backbone,
+            data_term=CONFIG.stage2.data_term,
+            priors=SEARCH.priors,
+        ),
     shell:
         "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
         " --model {input.model:q} {params.priors} --stage2 {params.stage2:q}"

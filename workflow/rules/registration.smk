@@ -14,7 +14,7 @@ rule calibration_targets:
         "../envs/dine.yaml"
     params:
         seed=CONFIG.seed,
-        code=code_digest("pairs"),
+        code=code_digest("resample"),
     shell:
         "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
         " --seed {params.seed} --out {output:q}"
@@ -39,7 +39,9 @@ rule calibrate:
     params:
         prior=lambda wildcards, input: options("--prior", input.prior),
         device=CONFIG.device,
-        code=code_digest("model", "priors", "calibration"),
+        code=lambda wildcards: code_of(
+            "calibrate", wildcards.backbone, priors=calibrating_priors(wildcards)
+        ),
     shell:
         "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
         " --pairs {input.pairs:q} --targets {input.targets:q} {params.prior} --device {params.device}"

@@ -29,7 +29,7 @@ rule tables:
     conda:
         "../envs/dine.yaml"
     params:
-        code=code_digest("reporting"),
+        code=code_digest("tables"),
     shell:
         'dine --log {log:q} tables {input:q} --out "$(dirname {output.all:q})"'
 
@@ -63,8 +63,8 @@ rule figures:
         "../envs/dine.yaml"
     params:
         results=RESULTS,
-        settings=section(CONFIG),
-        code=code_digest("reporting"),
+        settings=drawn_settings(),
+        code=code_digest("figures"),
     shell:
         "dine --log {log:q} figures --results {params.results:q} --settings {params.settings:q}"
         ' --out "$(dirname {output.figures[0]:q})"'
@@ -109,7 +109,7 @@ rule html:
     params:
         results=RESULTS,
         settings=section(CONFIG),
-        code=code_digest("reporting"),
+        code=code_digest("report"),
     shell:
         "dine --log {log:q} report --results {params.results:q} --settings {params.settings:q}"
         " --out {output:q}"
@@ -138,7 +138,7 @@ for PRIOR in CONFIG.priors:
         conda:
             "../envs/dine.yaml"
         params:
-            code=code_digest("reporting"),
+            code=code_digest("tables"),
         shell:
             'dine --log {log:q} tables {input:q} --out "$(dirname {output:q})"'
 

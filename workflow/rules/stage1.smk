@@ -24,7 +24,9 @@ rule stage1:
         settings=stage1_settings,
         seed=training_seed,
         compute=COMPUTE,
-        code=code_digest("model", "training"),
+        code=lambda wildcards: code_of(
+            "stage1", wildcards.backbone, data_term=CONFIG.stage1.data_term
+        ),
     shell:
         "dine --log {log:q} --threads {threads} stage1 --pairs {input.pairs:q}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
@@ -52,7 +54,7 @@ rule fields:
     params:
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=code_digest("model"),
+        code=lambda wildcards: code_of("fields", wildcards.backbone),
     shell:
         "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
         " --pairs {input.pairs:q} --batch-size {params.batch} {params.compute}"

@@ -21,7 +21,9 @@ rule stage2_control:
         settings=section(CONFIG.stage2),
         seed=training_seed,
         compute=COMPUTE,
-        code=code_digest("model", "training"),
+        code=lambda wildcards: code_of(
+            "stage2", wildcards.backbone, data_term=CONFIG.stage2.data_term
+        ),
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --settings {params.settings:q} --seed {params.seed}"
@@ -56,7 +58,12 @@ rule stage2_prior:
         settings=section(CONFIG.stage2),
         seed=training_seed,
         compute=COMPUTE,
-        code=code_digest("model", "priors", "training"),
+        code=lambda wildcards: code_of(
+            "stage2",
+            wildcards.backbone,
+            data_term=CONFIG.stage2.data_term,
+            priors=[wildcards.prior_of_stage2],
+        ),
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
         " --model {input.model:q} --variant {wildcards.prior_of_stage2} --prior {input.prior:q}"

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from dine.errors import DataError
-from dine.evaluation.predict import Condition, evaluation_conditions
+from dine.evaluation.conditions import Condition, evaluation_conditions
 from dine.evaluation.predictions import Prediction, read_predictions
 from dine.reporting.figures import Example, qualitative_figure, save_figure
 from dine.reporting.tables import display_name, setting_text

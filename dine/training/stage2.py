@@ -1,0 +1,138 @@
+"""Stage 2 and the search of λ, from files to files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dine.config import CONTROL, Compute, LambdaSearch, Stage2
+from dine.errors import ConfigError, DataError
+from dine.files import file_digest, read_json, write_json
+from dine.models.checkpoint import load_backbone
+from dine.models.inference import COMPUTE
+from dine.priors import load_prior
+from dine.training.data_terms import DATA_TERMS
+from dine.training.loop import VALIDATION_COLUMNS
+from dine.training.objective import Objective
+from dine.training.stages import run
+
+
+def selected_lambda(path: Path, prior: str) -> float:
+    """λ for a prior, from the file of the search.
+
+    Raises:
+        DataError: the file is not a search's result.
+    """
+    result = read_json(path)
+    try:
+        selected = result["selected"]
+        return float(selected.get(prior, selected[result["default"]]))
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise DataError(f"{path} is not the result of `dine search-lambda`.") from None
+
+
+def stage2(
+    pairs: Path,
+    model: Path,
+    settings: Stage2,
+    *,
+    variant: str,
+    prior: Path | None,
+    weight: float,
+    seed: int,
+    out: Path,
+    name: str,
+    compute: Compute = COMPUTE,
+) -> None:
+    """Refine a Stage-1 model with λ times a frozen prior.
+
+    ``lambda0`` is the control without; other variants without a prior differ in the data term.
+    """
+    if variant == CONTROL and prior is not None:
+        raise ConfigError(f"The variant {variant!r} takes no prior.")
+    backbone, facts = load_backbone(model)
+    run(
+        backbone,
+        Objective(
+            DATA_TERMS.get(settings.data_term)(), load_prior(prior) if prior else None, weight
+        ),
+        [pairs],
+        settings,
+        step="stage2",
+        seed=seed,
+        out=out,
+        name=name,
+        compute=compute,
+        inputs={
+            "model": file_digest(model),
+            "prior": file_digest(prior) if prior else None,
+            "lambda": weight,
+        },
+        facts={"stage": 2, "variant": variant, "lambda": weight, "backbone": facts["backbone"]},
+    )
+
+
+def search_lambda(
+    pairs: Path,
+    model: Path,
+    priors: dict[str, Path],
+    stage: Stage2,
+    search: LambdaSearch,
+    *,
+    seed: int,
+    out: Path,
+    compute: Compute = COMPUTE,
+) -> None:
+    """Try each λ on a shortened Stage 2; the lowest mean of the criterion on validation pairs wins.
+
+    λ = 0 is trained too, once, for comparison, but never chosen. Each candidate's result is kept,
+    so that an interrupted search goes on with the next one.
+    """
+    # One validation, at the end, on more pairs than training looks at.
+    settings = stage.model_copy(
+        update={
+            "steps": search.steps,
+            "validate_every": search.steps,
+            "validation_pairs": search.validation_pairs,
+        }
+    )
+    folder = out.with_name(f"{out.stem}_candidates")
+    curve = []
+    runs: list[tuple[str, float]] = [(CONTROL, 0.0)]
+    runs += [(prior, weight) for prior in priors for weight in sorted(search.candidates)]
+    for prior, weight in runs:
+        here = folder / f"{prior}_{weight:g}"
+        stage2(
+            pairs,
+            model,
+            settings,
+            variant=prior,
+            prior=priors.get(prior),
+            weight=weight,
+            seed=seed,
+            out=here,
+            name=f"search of λ: {prior} {weight:g}",
+            compute=compute,
+        )
+        final = read_json(here / "run.json")["final"]
+        # The control is every prior's value at λ = 0.
+        for label in priors if prior == CONTROL else (prior,):
+            errors = {name.removeprefix("val_"): final[name] for name in VALIDATION_COLUMNS}
+            curve.append({"prior": label, "lambda": weight, **errors})
+    selected = {}
+    for prior in priors:
+        tried = [row for row in curve if row["prior"] == prior and row["lambda"] > 0]
+        selected[prior] = min(tried, key=lambda row: row[search.criterion])["lambda"]
+    write_json(
+        out,
+        {
+            "dataset": search.dataset,
+            "backbone": search.backbone,
+            "default": next(iter(priors)),
+            "selected": selected,
+            "criterion": search.criterion,
+            "curve": curve,
+            "steps": search.steps,
+            "validation_pairs": search.validation_pairs,
+            "seed": seed,
+        },
+    )

@@ -1,0 +1,202 @@
+"""Kill the workflow at random moments in every step, run the same command again, compare.
+
+python tests/workflow/kills.py --kills 66 --seed 0 --record kills.csv
+
+A run without disturbance comes first. Then one after another is started and killed: a job,
+Snakemake alone (its jobs go on), or all processes at once. In the end the same command runs to its
+end, and its files must be those of the first run, bit for bit, but for the times named in
+``workplace.py``.
+"""
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import psutil
+from workplace import HERE, Job, Workplace, differences
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+VICTIMS = ("job", "snakemake", "group")
+PATIENCE = 900.0
+"""Seconds after which something hangs."""
+
+# Where the rule is called otherwise than the command.
+RULES = {
+    "fit-prior": "fit_prior",
+    "search-lambda": "search_lambda",
+    "stage2": "stage2_prior",
+    "config": "resolved_config",
+    "report": "html",
+    "resample": "evidence_resample",
+    "classical": "evidence_classical",
+    "refine-predictions": "evidence_refine",
+    "diagnose": "evidence_diagnose",
+}
+
+
+@dataclass
+class Kill:
+    """One kill: in a step's job, ``moment`` of the usual time of such a job after its start."""
+
+    step: str
+    victim: str
+    signal: int
+    moment: float
+    at_once: bool = False
+    """Whether the next run starts while jobs of this one still go on."""
+    forced: bool = False
+    """Whether the step was finished already and forced to run once more."""
+    seconds: float = float("nan")
+    """After the job was seen."""
+    running: str = ""
+    """All steps at that moment."""
+    left: str = ""
+    """Steps of jobs that went on after Snakemake's end."""
+
+
+def drawn(steps: list[str], count: int, seed: int) -> list[Kill]:
+    """``count`` kills, step by step in the order of the workflow."""
+    rng = np.random.default_rng(seed)
+    return [
+        Kill(
+            steps[number * len(steps) // count],
+            str(rng.choice(VICTIMS)),
+            int(rng.choice(SIGNALS, p=(0.5, 0.25, 0.25))),
+            float(rng.uniform()),
+            bool(rng.uniform() < 0.5),
+        )
+        for number in range(count)
+    ]
+
+
+def watch(place: Workplace, process: subprocess.Popen) -> dict[str, float]:
+    """Seconds that a job of each step takes, in the order in which they first appear."""
+    seen: dict[int, tuple[str, float, float]] = {}
+    while process.poll() is None:
+        now = time.monotonic()
+        for job in place.jobs():
+            _, first, _ = seen.get(job.process.pid, (job.step, now, now))
+            seen[job.process.pid] = (job.step, first, now)
+        time.sleep(0.05)
+    if process.returncode:
+        raise AssertionError((place.folder / "said.txt").read_text()[-3000:])
+    steps = dict.fromkeys(step for step, *_ in seen.values())
+    spans = {step: [b - a for s, a, b in seen.values() if s == step] for step in steps}
+    return {step: float(np.mean(span)) for step, span in spans.items()}
+
+
+def wait_for(place: Workplace, step: str, process: subprocess.Popen) -> Job | None:
+    """A running job of a step; None when Snakemake ends without one."""
+    while process.poll() is None:
+        for job in place.jobs():
+            if job.step == step:
+                return job
+        time.sleep(0.02)
+    return None
+
+
+def settle(place: Workplace) -> None:
+    """Wait until no job runs any more."""
+    psutil.wait_procs([job.process for job in place.jobs()], timeout=PATIENCE)
+    if place.jobs():
+        raise AssertionError(f"still running: {place.jobs()}")
+
+
+def perform(
+    place: Workplace, kill: Kill, targets: list[str], usual: dict[str, float], cores: int
+) -> bool:
+    """Start the workflow and kill it; whether there was anything to kill."""
+    place.unlock()
+    force = ["-R", RULES.get(kill.step, kill.step)] if kill.forced else []
+    process = place.start(*targets, *force, cores=cores)
+    job = wait_for(place, kill.step, process)
+    if job is None:
+        return False
+    began = time.monotonic()
+    due = began + kill.moment * usual[kill.step]
+    while time.monotonic() < due and job.process.is_running():
+        time.sleep(0.01)
+    if process.poll() is not None:
+        return False
+    kill.running = " ".join(sorted(job.step for job in place.jobs()))
+    kill.seconds = time.monotonic() - began
+    try:
+        if kill.victim == "job":
+            job.process.send_signal(kill.signal)
+        elif kill.victim == "snakemake":
+            process.send_signal(kill.signal)
+        else:
+            os.killpg(process.pid, kill.signal)
+    except (psutil.NoSuchProcess, ProcessLookupError):  # it has just ended by itself
+        process.wait(PATIENCE)
+        return False
+    process.wait(PATIENCE)
+    kill.left = " ".join(sorted(job.step for job in place.jobs()))
+    if not kill.at_once:
+        settle(place)
+    return True
+
+
+def finish(place: Workplace, targets: list[str], cores: int) -> str:
+    """The same command once more, to the end."""
+    settle(place)
+    place.unlock()
+    return place.run(*targets, cores=cores)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=66)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--cores", type=int, default=2)
+    parser.add_argument("--record", type=Path, help="CSV with one row for each kill.")
+    parser.add_argument("--keep", type=Path, help="Folder to work in, kept afterwards.")
+    options = parser.parse_args()
+    root = Path(options.keep or tempfile.mkdtemp(prefix="dine-kills-"))
+    targets = ["all", "evidence", "pretrained"]
+    (root / "run").mkdir(parents=True)
+    place = Workplace(root / "run", HERE / "smallest.yaml", HERE / "kills.yaml")
+    began = time.monotonic()
+    usual = watch(place, place.start(*targets, cores=options.cores))
+    print(f"undisturbed: {time.monotonic() - began:.0f} s, {len(usual)} steps", flush=True)
+    whole = place.copy(root / "undisturbed")
+    for name in ("results", ".snakemake"):
+        shutil.rmtree(place.folder / name)
+    done: list[Kill] = []
+    for kill in drawn(list(usual), options.kills, options.seed):
+        # Where nothing of a step is left to do, it is made to run once more.
+        for kill.forced in (False, True):
+            if perform(place, kill, targets, usual, options.cores):
+                done.append(kill)
+                break
+        name = signal.Signals(kill.signal).name
+        print(
+            f"{len(done):3} {kill.step:18} {kill.victim:9} {name} after {kill.seconds:5.1f} s"
+            f"{' (forced)' if kill.forced else ''}; running: {kill.running}; left: {kill.left}",
+            flush=True,
+        )
+        if options.record:
+            pd.DataFrame(map(asdict, done)).to_csv(options.record, index=False)
+    finish(place, targets, options.cores)
+    odd = differences(whole.results, place.results)
+    said = (place.folder / "said.txt").read_text()
+    resumed, refused = said.count("going on from step"), said.count("is in use by")
+    print(f"{len(done)} kills in {time.monotonic() - began:.0f} s with seed {options.seed}:")
+    print(f"  trainings that went on from a saved state: {resumed}, refused folders: {refused}")
+    print(f"  files that differ from the undisturbed run: {', '.join(odd) or 'none'}")
+    if not options.keep:
+        shutil.rmtree(root)
+    return int(bool(odd) or len(done) < options.kills)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

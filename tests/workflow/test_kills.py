@@ -1,0 +1,33 @@
+"""A small version of ``make kill-test``: some kills, then the files of an undisturbed run."""
+
+import signal
+
+import pytest
+from kills import Kill, finish, perform
+from workplace import differences
+
+# Each at another stage of a job: Python starting, computing, writing.
+KILLS = [
+    Kill("raw", "group", signal.SIGKILL, 0.9),
+    Kill("stage1", "job", signal.SIGKILL, 0.8),
+    Kill("stage1", "group", signal.SIGTERM, 0.9),
+    Kill("stage2", "snakemake", signal.SIGKILL, 0.6, at_once=True),
+    Kill("predict", "group", signal.SIGINT, 0.5),
+]
+USUAL = dict.fromkeys(("raw", "stage1", "stage2", "predict"), 2.5)
+
+
+@pytest.fixture(scope="module")
+def killed(undisturbed):
+    """The run of ``undisturbed`` again, one job at a time, with kills; the command's last words."""
+    for kill in KILLS:
+        assert perform(undisturbed.place, kill, ["all"], USUAL, cores=1), kill
+    return finish(undisturbed.place, ["all"], cores=1)
+
+
+def test_a_killed_run_gives_the_files_of_an_undisturbed_one(undisturbed, killed):
+    assert differences(undisturbed.finished.results, undisturbed.place.results) == []
+
+
+def test_nothing_is_left_to_do(undisturbed, killed):
+    assert "Nothing to be done" in undisturbed.place.run("all")
