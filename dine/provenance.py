@@ -14,7 +14,7 @@ from dine import __version__
 
 PACKAGE = Path(__file__).parent
 
-_READING = ("data/surface.py", "data/readers.py", "data/layout.py")
+_READING = ("data/surface.py", "data/readers.py", "data/vtk.py", "data/layout.py")
 
 LAYERS: dict[str, tuple[str, ...]] = {
     # What a step's result depends on, as paths below the package.
