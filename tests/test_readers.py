@@ -237,6 +237,7 @@ def test_pieces_of_a_vtp_follow_each_other(tmp_path):
         ("text.vtp", b"VTKFile type", b"VTKFile kind", "of the kind None"),
         ("text_4.vtk", b"0 0 0", b"0 0 nan", "NaN or infinite"),
         ("text_4.vtk", b"3 0 1 2", b"2 0 1 2", "do not add up|fewer than 3 corners"),
+        ("text.vtp", b"3 7 12", b"3 7 11", "faces of 11 corners where there are 12"),
         ("text_4.vtk", b"3 0 1 2", b"3 0 1 99", "names vertex 99"),
         ("text_4.vtk", b"DATASET", b"NOTHING", "names no data set"),
         ("text_4.vtk", b"POINTS 9", b"POINTS 0", "holds no points"),
