@@ -164,6 +164,21 @@ def test_verdicts(values, verdict, said):
     assert trust.reasons == () if said is None else said in " ".join(trust.reasons)
 
 
+@pytest.mark.parametrize(
+    ("checks", "said"),
+    [
+        ({"remaining": 0.4, "uncertain": 0.9, "inconsistency": 0.09}, None),
+        ({"remaining": 0.6}, "60 % of the Chamfer distance before is left"),
+        ({"uncertain": 1.1}, "expected error is larger than the displacement"),
+        ({"inconsistency": 0.12}, "and back, points end up 12 % of"),
+    ],
+)
+def test_checks_make_a_result_doubtful(checks, said):
+    trust = assess(calibration(), {"final": 0.1}, 0.1, checks=checks)
+    assert trust.verdict == (GOOD if said is None else DOUBTFUL)
+    assert trust.reasons == () if said is None else said in trust.reasons[0]
+
+
 def test_without_calibration_nothing_is_called_plausible():
     trust = assess(None, {"folding": 0.0}, None)
     assert trust.verdict == DOUBTFUL
@@ -303,10 +318,22 @@ def test_bad_settings_are_refused(pair, settings, said):
         dine.register(*pair, **{"points": POINTS, **settings})
 
 
-def test_objects_without_anything_in_common_are_not_called_plausible(pair):
+def test_objects_without_anything_in_common_are_not_called_plausible(pair, result):
     source = pair[0]
     plate = np.random.default_rng(8).uniform(-1, 1, size=(2000, 3)) * [1.5, 1.5, 0.01]
-    assert dine.register(source, plate, points=POINTS).trust.verdict != GOOD
+    found = dine.register(source, plate, points=POINTS)
+    assert found.trust.verdict != GOOD
+    assert "and back" in " ".join(found.trust.reasons)
+    inconsistency = [x.report["trust"]["checks"]["inconsistency"] for x in (result, found)]
+    assert inconsistency[0] < 0.1 < inconsistency[1]
+
+
+def test_nothing_to_move_is_not_called_plausible(pair):
+    source = pair[0]
+    found = dine.register(source, Surface(source.vertices + 1e-3, source.faces), points=POINTS)
+    assert found.report["trust"]["checks"]["remaining"] > 0.5
+    assert found.trust.verdict == DOUBTFUL
+    assert "may be noise" in " ".join(found.trust.reasons)
 
 
 def test_weights_must_fit(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from dine import __version__
@@ -231,6 +232,7 @@ def register(
     notes: list[str] = []
     if rounds < 0:
         raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
+    inconsistency = None
     if partial:
         found, supported = _from_part(start, goal, rounds)
         spread = None
@@ -242,6 +244,7 @@ def register(
     else:
         found, spread = find_field(model.backbone, start, goal, where, rounds)
         supported = np.ones(len(start), bool)
+        inconsistency = _inconsistency(model, start, goal, found, where, rounds)
     return _result(
         began,
         model,
@@ -255,6 +258,7 @@ def register(
         found,
         spread,
         supported,
+        inconsistency,
         apply or {},
         landmarks,
         tuple(notes),
@@ -282,6 +286,7 @@ def _result(
     found: np.ndarray,
     spread: np.ndarray | None,
     supported: np.ndarray,
+    inconsistency: float | None,
     apply: Mapping[str, Shape],
     landmarks: tuple[np.ndarray, np.ndarray] | None,
     notes: tuple[str, ...],
@@ -315,16 +320,24 @@ def _result(
     }
     if model.prior is not None and model.convention != "none":
         values |= plausibility(model.prior, found, start) or {}
-    trust = assess(calibration, values, expected, notes=notes)
     dense_target = _dense(target)
     dense_source = _dense(source)
+    aligned = fit(transformed(dense_source, matrix), dense_target, partial=partial)
+    after = fit(move(dense_source), dense_target, partial=partial)
+    checks = {"remaining": _ratio(after["chamfer"], aligned["chamfer"])}
+    if inconsistency is not None:
+        checks["inconsistency"] = inconsistency
+    if at_points is not None:
+        moved_by = float(np.linalg.norm(found, axis=1).mean()) * frame.scale
+        checks["uncertain"] = _ratio(float(at_points.mean()), moved_by)
+    trust = assess(calibration, values, expected, checks=checks, notes=notes)
     report: dict[str, Any] = {
         "dine": __version__,
         "source": {"name": source.name, "vertices": len(source.vertices)},
         "target": {"name": target.name, "vertices": len(target.vertices)},
         "before": fit(dense_source, dense_target, partial=partial),
-        "aligned": fit(transformed(dense_source, matrix), dense_target, partial=partial),
-        "after": fit(move(dense_source), dense_target, partial=partial),
+        "aligned": aligned,
+        "after": after,
         "normalised": values,
         "folding": values["folding"],
         "displacement": {
@@ -335,6 +348,7 @@ def _result(
             "verdict": trust.verdict,
             "reasons": list(trust.reasons),
             "percentiles": trust.percentiles,
+            "checks": checks,
             "expected_error": trust.expected_error,
         },
         "alignment": matrix.tolist(),
@@ -468,6 +482,30 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> tuple[np.nda
             "object, or leave out `partial`."
         )
     return carry(places, -back, start), supported
+
+
+def _inconsistency(
+    model: Model,
+    start: np.ndarray,
+    goal: np.ndarray,
+    found: np.ndarray,
+    where: torch.device,
+    rounds: int,
+) -> float:
+    """Mean distance from where they began of points moved to the target and, by the field of the
+    opposite registration, back; normalised frame.
+
+    A wrong correspondence can fit as well as the right one, but is seldom found from both sides.
+    """
+    frame = Frame.of(goal)
+    seen, whole = frame.normalise(goal), frame.normalise(start)
+    back = find_field(model.backbone, seen, whole, where, rounds)[0] * frame.scale
+    places = start + found
+    return float(np.linalg.norm(found + carry(goal, back, places), axis=1).mean())
+
+
+def _ratio(value: float, of: float) -> float:
+    return value / of if of > 0 else 1.0
 
 
 def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:
