@@ -1,10 +1,30 @@
 # What `dine register` needs beside a trained model; `snakemake -j2 calibrations`. Not part of `all`.
 
 
+# Two scans share no points, so errors are learned on targets of other points.
+rule resample:
+    input:
+        raw=rules.raw.output.raw,
+        pairs=rules.pairs.output,
+    output:
+        RESULTS / "{dataset}" / "resampled.h5",
+    log:
+        LOGS / "{dataset}" / "resample.log",
+    conda:
+        "../envs/dine.yaml"
+    params:
+        seed=CONFIG.seed,
+        code=code_digest("pairs"),
+    shell:
+        "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
+        " --seed {params.seed} --out {output:q}"
+
+
 rule calibrate:
     input:
         model=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "model.safetensors",
         pairs=rules.pairs.output,
+        targets=rules.resample.output,
         prior=calibrating_prior,
     output:
         calibration=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "calibration.json",
@@ -22,7 +42,7 @@ rule calibrate:
         code=code_digest("model", "priors", "calibration"),
     shell:
         "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
-        " --pairs {input.pairs:q} {params.prior} --device {params.device}"
+        " --pairs {input.pairs:q} --targets {input.targets:q} {params.prior} --device {params.device}"
         " --out {output.calibration:q}"
 
 
