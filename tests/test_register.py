@@ -21,6 +21,7 @@ from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior
 from dine.registration.calibration import Calibration, load_calibration, plausibility
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
+from dine.registration.refine import ROUNDS
 from dine.registration.register import load_model
 from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 
@@ -407,6 +408,9 @@ def test_command_writes_everything(files, tmp_path, pair):
         assert np.allclose(field["points"] + field["displacement"], moved.vertices)
     assert np.allclose(read_surface(out.with_suffix(".before.ply")).vertices, moved.vertices)
     assert report["weights"]["sha256"]
+    # The same settings as from Python, for which the shipped weights are calibrated.
+    assert report["settings"]["rounds"] == ROUNDS
+    assert report["trust"]["expected_error"] > 0
 
 
 def test_command_keeps_what_exists(files, tmp_path):
