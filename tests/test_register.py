@@ -289,8 +289,8 @@ LINE = np.outer(np.linspace(0, 1, 100), [1, 2, 3])
 @pytest.mark.parametrize(
     ("source", "said"),
     [
-        (np.zeros((1, 3)), "coincide"),
-        (np.ones((50, 3)), "coincide"),
+        (np.zeros((1, 3)), "the source, coincide"),
+        (np.ones((50, 3)) / 3, "coincide"),
         (np.random.default_rng(5).normal(size=(8, 3)), "distinct points"),
         (LINE, "on one line"),
         (np.full((50, 3), np.nan), "NaN"),
@@ -327,6 +327,21 @@ def test_objects_without_anything_in_common_are_not_called_plausible(pair, resul
     assert "and back" in " ".join(found.trust.reasons)
     inconsistency = [x.report["trust"]["checks"]["inconsistency"] for x in (result, found)]
     assert inconsistency[0] < 0.1 < inconsistency[1]
+
+
+def test_a_target_beside_the_source_is_not_called_plausible():
+    points = np.random.default_rng(12).normal(size=(200, 3))
+    found = dine.register(points, points + 100, prealign="off")
+    assert found.trust.verdict == IMPLAUSIBLE
+    assert "of the Chamfer distance before is left" in " ".join(found.trust.reasons)
+
+
+def test_inches_and_centimetres_are_told_apart():
+    points = np.random.default_rng(13).normal(size=(200, 3)) * [1, 0.8, 0.6]
+    found = dine.register(points, points * 2.54)
+    assert found.trust.verdict != GOOD
+    assert "2.5 times larger" in found.trust.reasons[0]
+    assert "in inches and the other in centimetres" in found.trust.reasons[0]
 
 
 def test_nothing_to_move_is_not_called_plausible(pair):

@@ -44,8 +44,10 @@ POINTS = 1024
 FEWEST = 16
 # Extents that differ by more than this come from other units or other objects.
 _LARGEST_RATIO = 3.0
+# Tissue hardly grows or shrinks that much, but from inches to centimetres it is 2.54.
+_UNUSUAL_RATIO = 1.5
 _UNITS = {1000: "metres and millimetres", 100: "metres and centimetres", 10: "cm and mm"}
-_UNITS |= {25.4: "inches and millimetres"}
+_UNITS |= {25.4: "inches and millimetres", 2.54: "inches and centimetres"}
 # A source point is shown by the target if a target point ends up within so many spacings of it.
 _RETURN = 3.0
 
@@ -217,7 +219,7 @@ def register(
     began = time.perf_counter()
     model = model or load_model()
     source, target = as_surface(source, "source"), as_surface(target, "target")
-    _check_sizes(source, target)
+    notes = _check_sizes(source, target, partial)
     rng = np.random.default_rng([4, seed])
     samples = _draw(source, points, rng, "source")
     seen = _draw(target, points, rng, "target").carry(target.vertices)
@@ -229,7 +231,6 @@ def register(
     places, start = places[order], start[order]
     goal = frame.normalise(seen)
     where = chosen_device(device)
-    notes: list[str] = []
     if rounds < 0:
         raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
     inconsistency = None
@@ -427,25 +428,35 @@ def _dense(surface: Surface) -> np.ndarray:
     return sample_surface(surface, 4 * POINTS, rng).carry(surface.vertices)
 
 
-def _check_sizes(source: Surface, target: Surface) -> None:
-    sizes = [
-        float(np.linalg.norm(s.vertices - s.vertices.mean(axis=0), axis=1).mean())
-        for s in (source, target)
-    ]
-    if min(sizes) == 0:
-        raise DataError("All points of the source or of the target coincide.")
+def _check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
+    """What to say of sizes that differ much.
+
+    Raises:
+        DataError: a shape is a single place, or sizes differ so much that units must.
+    """
+    sizes = []
+    for surface, what in ((source, "source"), (target, "target")):
+        middle = surface.vertices.mean(axis=0)
+        sizes.append(float(np.linalg.norm(surface.vertices - middle, axis=1).mean()))
+        if len(surface.vertices) == 1 or sizes[-1] <= 1e-12 * np.abs(middle).max():
+            raise DataError(
+                f"All points of {surface.name}, the {what}, coincide; expected the surface of an "
+                "object."
+            )
     ratio = max(sizes) / min(sizes)
-    if ratio <= _LARGEST_RATIO:
-        return
-    larger = "source" if sizes[0] > sizes[1] else "target"
+    larger, other = (source, target) if sizes[0] > sizes[1] else (target, source)
     units = [text for factor, text in _UNITS.items() if 0.7 < ratio / factor < 1.4]
     guess = (
         f" Perhaps one is in {units[0].replace(' and ', ' and the other in ')}." if units else ""
     )
-    raise DataError(
-        f"The {larger} is {ratio:.3g} times larger than the other; both must be in the same units "
-        f"and show the same object.{guess}"
-    )
+    if ratio > _LARGEST_RATIO:
+        raise DataError(
+            f"{larger.name} is {ratio:.3g} times larger than {other.name}; both must be in the "
+            f"same units and show the same object.{guess}"
+        )
+    if ratio > _UNUSUAL_RATIO and not partial:
+        return [f"{larger.name} is {ratio:.2g} times larger than {other.name}.{guess}"]
+    return []
 
 
 def _aligned(
