@@ -793,7 +793,8 @@ def registration_options(command):
             "--map",
             "rounds",
             type=click.IntRange(0),
-            default=20,
+            default=40,  # as dine.register; other numbers have no calibration
+            show_default=True,
             help="Rounds of refinement at test time; 0 for the network's own field.",
         ),
         click.option(

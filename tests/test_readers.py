@@ -1,5 +1,6 @@
 import io
 import pickle
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -50,7 +51,7 @@ def ply_text(faces=FACES):
 
 
 def test_every_suffix_is_covered_here():
-    meshes = {".ply", ".obj", ".off", ".stl", ".glb", ".gltf"}
+    meshes = {".ply", ".obj", ".off", ".stl", ".glb", ".gltf", ".vtp", ".vtk"}
     arrays = {".xyz", ".txt", ".csv", ".npy", ".npz", ".h5", ".mat"}
     assert meshes | arrays <= set(READABLE_SUFFIXES)
     assert all(suffix == suffix.lower() and suffix[0] == "." for suffix in READABLE_SUFFIXES)
@@ -187,6 +188,69 @@ def test_the_meshes_of_a_scene_follow_each_other(tmp_path):
 def test_meshes_without_faces_are_clouds(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     assert_same(read_surface(tmp_path / name), faces=None)
+
+
+# --- VTK --------------------------------------------------------------------------------------
+
+SAMPLES = Path(__file__).parent / "data" / "vtk"
+"""Written by VTK; see ``write.py`` there."""
+GRID = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0.5], [3, 0, 1], [3, 1, 1], [2, 2, 0.5]]
+GRID += [[9, 9, 9]]
+FANS = [[0, 1, 2], [4, 5, 6], [4, 6, 7], [0, 1, 6], [0, 6, 7], [0, 7, 3]]
+# Every second triangle of a strip is turned round, so that all face the same side.
+STRIP = [[0, 1, 3], [1, 2, 3], [3, 2, 7]]
+
+
+@pytest.mark.parametrize("name", sorted(p.name for p in SAMPLES.glob("*.vt*")))
+def test_vtk_samples(name):
+    if name.startswith("grid"):
+        with pytest.raises(DataError, match=r"kind UNSTRUCT\w+; .*Extract Surface|kind Unstruct"):
+            read_surface(SAMPLES / name)
+        return
+    if name == "raw_lz4.vtp":
+        with pytest.raises(DataError, match=r"vtkLZ4DataCompressor.*ZLib or None"):
+            read_surface(SAMPLES / name)
+        return
+    faces = {"strips": STRIP, "cloud": None}.get(name.partition(".")[0], FANS)
+    assert_same(read_surface(SAMPLES / name), GRID, faces)
+
+
+def test_pieces_of_a_vtp_follow_each_other(tmp_path):
+    text = (SAMPLES / "text.vtp").read_text()
+    piece = text[text.index("<Piece") : text.index("</Piece>") + len("</Piece>")]
+    (tmp_path / "a.vtp").write_text(text.replace(piece, piece + piece))
+    faces = np.concatenate([FANS, np.array(FANS) + len(GRID)])
+    assert_same(read_surface(tmp_path / "a.vtp"), GRID + GRID, faces)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "said"),
+    [
+        ("raw.vtp", -300, b"", "damaged, cut short"),
+        ("raw_zlib.vtp", -300, b"", "damaged, cut short"),
+        ("appended_zlib.vtp", -300, b"", "damaged, cut short"),
+        ("inline.vtp", -300, b"", "damaged, cut short"),
+        ("binary_4.vtk", -500, b"", "damaged, cut short"),
+        ("text_4.vtk", 120, b"", "numbers where 27 are announced"),
+        ("text.vtp", b'NumberOfPoints="9"', b'NumberOfPoints="8"', "9 points where 8"),
+        ("text.vtp", b"<Points>", b"<Pts>", "damaged"),
+        ("text.vtp", b"VTKFile type", b"VTKFile kind", "of the kind None"),
+        ("text_4.vtk", b"0 0 0", b"0 0 nan", "NaN or infinite"),
+        ("text_4.vtk", b"3 0 1 2", b"2 0 1 2", "do not add up|fewer than 3 corners"),
+        ("text.vtp", b"3 7 12", b"3 7 11", "faces of 11 corners where there are 12"),
+        ("text_4.vtk", b"3 0 1 2", b"3 0 1 99", "names vertex 99"),
+        ("text_4.vtk", b"DATASET", b"NOTHING", "names no data set"),
+        ("text_4.vtk", b"POINTS 9", b"POINTS 0", "holds no points"),
+    ],
+)
+def test_damaged_vtk(tmp_path, name, old, new, said):
+    content = (SAMPLES / name).read_bytes()
+    changed = content[:old] if isinstance(old, int) else content.replace(old, new, 1)
+    assert changed != content
+    (tmp_path / name).write_bytes(changed)
+    with pytest.raises(DataError, match=said) as caught:
+        read_surface(tmp_path / name)
+    assert "\n" not in str(caught.value)
 
 
 # --- tables and arrays ------------------------------------------------------------------------

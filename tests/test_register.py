@@ -21,6 +21,7 @@ from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior
 from dine.registration.calibration import Calibration, load_calibration, plausibility
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
+from dine.registration.refine import ROUNDS
 from dine.registration.register import load_model
 from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 
@@ -164,6 +165,21 @@ def test_verdicts(values, verdict, said):
     assert trust.reasons == () if said is None else said in " ".join(trust.reasons)
 
 
+@pytest.mark.parametrize(
+    ("checks", "said"),
+    [
+        ({"remaining": 0.4, "uncertain": 0.9, "inconsistency": 0.09}, None),
+        ({"remaining": 0.6}, "60 % of the Chamfer distance before is left"),
+        ({"uncertain": 1.1}, "expected error is larger than the displacement"),
+        ({"inconsistency": 0.12}, "and back, points end up 12 % of"),
+    ],
+)
+def test_checks_make_a_result_doubtful(checks, said):
+    trust = assess(calibration(), {"final": 0.1}, 0.1, checks=checks)
+    assert trust.verdict == (GOOD if said is None else DOUBTFUL)
+    assert trust.reasons == () if said is None else said in trust.reasons[0]
+
+
 def test_without_calibration_nothing_is_called_plausible():
     trust = assess(None, {"folding": 0.0}, None)
     assert trust.verdict == DOUBTFUL
@@ -273,8 +289,8 @@ LINE = np.outer(np.linspace(0, 1, 100), [1, 2, 3])
 @pytest.mark.parametrize(
     ("source", "said"),
     [
-        (np.zeros((1, 3)), "coincide"),
-        (np.ones((50, 3)), "coincide"),
+        (np.zeros((1, 3)), "the source, coincide"),
+        (np.ones((50, 3)) / 3, "coincide"),
         (np.random.default_rng(5).normal(size=(8, 3)), "distinct points"),
         (LINE, "on one line"),
         (np.full((50, 3), np.nan), "NaN"),
@@ -303,10 +319,37 @@ def test_bad_settings_are_refused(pair, settings, said):
         dine.register(*pair, **{"points": POINTS, **settings})
 
 
-def test_objects_without_anything_in_common_are_not_called_plausible(pair):
+def test_objects_without_anything_in_common_are_not_called_plausible(pair, result):
     source = pair[0]
     plate = np.random.default_rng(8).uniform(-1, 1, size=(2000, 3)) * [1.5, 1.5, 0.01]
-    assert dine.register(source, plate, points=POINTS).trust.verdict != GOOD
+    found = dine.register(source, plate, points=POINTS)
+    assert found.trust.verdict != GOOD
+    assert "and back" in " ".join(found.trust.reasons)
+    inconsistency = [x.report["trust"]["checks"]["inconsistency"] for x in (result, found)]
+    assert inconsistency[0] < 0.1 < inconsistency[1]
+
+
+def test_a_target_beside_the_source_is_not_called_plausible():
+    points = np.random.default_rng(12).normal(size=(200, 3))
+    found = dine.register(points, points + 100, prealign="off")
+    assert found.trust.verdict == IMPLAUSIBLE
+    assert "of the Chamfer distance before is left" in " ".join(found.trust.reasons)
+
+
+def test_inches_and_centimetres_are_told_apart():
+    points = np.random.default_rng(13).normal(size=(200, 3)) * [1, 0.8, 0.6]
+    found = dine.register(points, points * 2.54)
+    assert found.trust.verdict != GOOD
+    assert "2.5 times larger" in found.trust.reasons[0]
+    assert "in inches and the other in centimetres" in found.trust.reasons[0]
+
+
+def test_nothing_to_move_is_not_called_plausible(pair):
+    source = pair[0]
+    found = dine.register(source, Surface(source.vertices + 1e-3, source.faces), points=POINTS)
+    assert found.report["trust"]["checks"]["remaining"] > 0.5
+    assert found.trust.verdict == DOUBTFUL
+    assert "may be noise" in " ".join(found.trust.reasons)
 
 
 def test_weights_must_fit(tmp_path):
@@ -380,6 +423,9 @@ def test_command_writes_everything(files, tmp_path, pair):
         assert np.allclose(field["points"] + field["displacement"], moved.vertices)
     assert np.allclose(read_surface(out.with_suffix(".before.ply")).vertices, moved.vertices)
     assert report["weights"]["sha256"]
+    # The same settings as from Python, for which the shipped weights are calibrated.
+    assert report["settings"]["rounds"] == ROUNDS
+    assert report["trust"]["expected_error"] > 0
 
 
 def test_command_keeps_what_exists(files, tmp_path):

@@ -204,6 +204,52 @@ def test_size_of_the_file(tmp_path):
     assert (tmp_path / "a.html").stat().st_size < 2.7e6
 
 
+def sheet(side):
+    """A wavy grid of side² vertices."""
+    x, y = np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side))
+    grid = np.column_stack([x.ravel(), y.ravel(), 0.1 * np.sin(9 * x.ravel())])
+    corner = np.arange((side - 1) * side).reshape(side - 1, side)[:, :-1].ravel()
+    faces = [corner[:, None] + [0, 1, side], corner[:, None] + [1, side + 1, side]]
+    return Surface(grid, np.concatenate(faces))
+
+
+@pytest.mark.parametrize("form", ["mesh", "triangles apart", "cloud", "nothing to simplify"])
+def test_huge_shapes_are_drawn_in_part(tmp_path, monkeypatch, form):
+    monkeypatch.setattr("dine.registration.view._MOST", 500)
+    mesh = sheet(60)
+    if form == "triangles apart":
+        mesh = Surface(
+            mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+        )
+    elif form == "cloud":
+        mesh = Surface(mesh.vertices)
+    elif form == "nothing to simplify":
+        corners = np.random.default_rng(0).random((3000, 3))
+        mesh = Surface(corners, np.arange(3000).reshape(-1, 3))
+    count = len(mesh.vertices)
+    result = mesh.vertices + np.array([0, 0, 0.5])
+    number = np.arange(count, dtype=float)
+    page = view(tmp_path / "a.html", source=mesh, target=mesh, result=result, scalars={"n": number})
+    data = page.data()
+    rows = decode(data["source"]["rows"])
+    assert 50 < len(rows) <= 750
+    assert decode(data["scalars"][0]["values"]).tolist() == rows.tolist()
+    for shape, vertices in (("source", mesh.vertices), ("result", result)):
+        drawn = data[shape]["positions"] if shape == "source" else data[shape]
+        places = decode(drawn).reshape(-1, 3) * data["radius"] + data["centre"]
+        np.testing.assert_allclose(places, vertices[rows], atol=1e-6)
+    assert any(
+        f"{count:,}" in text and f"{len(rows):,} of them drawn" in text for text in page.of("small")
+    )
+    if form in ("mesh", "triangles apart"):
+        corners = mesh.vertices[rows][decode(data["source"]["faces"]).reshape(-1, 3)]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(normals, axis=1).sum() / 2
+        assert area == pytest.approx(1.17, abs=0.1)
+    else:
+        assert data["source"]["faces"] is None
+
+
 def test_what_is_refused(tmp_path):
     with pytest.raises(DataError, match=r"does not fit a source"):
         view(tmp_path / "a.html", result=RESULT[:-1])

@@ -21,6 +21,7 @@ import scipy.io
 import trimesh
 
 from dine.data.surface import Surface
+from dine.data.vtk import read_vtk, read_vtp
 from dine.errors import DataError
 from dine.files import atomic_path
 
@@ -345,6 +346,8 @@ _READERS: dict[str, Callable[[Path], _Arrays]] = {
     if f".{name}" not in _NOT_MESH_FILES
 } | {
     ".obj": _read_obj,
+    ".vtp": read_vtp,
+    ".vtk": read_vtk,
     ".xyz": _read_text,
     ".txt": _read_text,
     ".csv": _read_text,

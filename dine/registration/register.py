@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from dine import __version__
@@ -43,8 +44,10 @@ POINTS = 1024
 FEWEST = 16
 # Extents that differ by more than this come from other units or other objects.
 _LARGEST_RATIO = 3.0
+# Tissue hardly grows or shrinks that much, but from inches to centimetres it is 2.54.
+_UNUSUAL_RATIO = 1.5
 _UNITS = {1000: "metres and millimetres", 100: "metres and centimetres", 10: "cm and mm"}
-_UNITS |= {25.4: "inches and millimetres"}
+_UNITS |= {25.4: "inches and millimetres", 2.54: "inches and centimetres"}
 # A source point is shown by the target if a target point ends up within so many spacings of it.
 _RETURN = 3.0
 
@@ -216,7 +219,7 @@ def register(
     began = time.perf_counter()
     model = model or load_model()
     source, target = as_surface(source, "source"), as_surface(target, "target")
-    _check_sizes(source, target)
+    notes = _check_sizes(source, target, partial)
     rng = np.random.default_rng([4, seed])
     samples = _draw(source, points, rng, "source")
     seen = _draw(target, points, rng, "target").carry(target.vertices)
@@ -228,9 +231,9 @@ def register(
     places, start = places[order], start[order]
     goal = frame.normalise(seen)
     where = chosen_device(device)
-    notes: list[str] = []
     if rounds < 0:
         raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
+    inconsistency = None
     if partial:
         found, supported = _from_part(start, goal, rounds)
         spread = None
@@ -242,6 +245,7 @@ def register(
     else:
         found, spread = find_field(model.backbone, start, goal, where, rounds)
         supported = np.ones(len(start), bool)
+        inconsistency = _inconsistency(model, start, goal, found, where, rounds)
     return _result(
         began,
         model,
@@ -255,6 +259,7 @@ def register(
         found,
         spread,
         supported,
+        inconsistency,
         apply or {},
         landmarks,
         tuple(notes),
@@ -282,6 +287,7 @@ def _result(
     found: np.ndarray,
     spread: np.ndarray | None,
     supported: np.ndarray,
+    inconsistency: float | None,
     apply: Mapping[str, Shape],
     landmarks: tuple[np.ndarray, np.ndarray] | None,
     notes: tuple[str, ...],
@@ -315,16 +321,24 @@ def _result(
     }
     if model.prior is not None and model.convention != "none":
         values |= plausibility(model.prior, found, start) or {}
-    trust = assess(calibration, values, expected, notes=notes)
     dense_target = _dense(target)
     dense_source = _dense(source)
+    aligned = fit(transformed(dense_source, matrix), dense_target, partial=partial)
+    after = fit(move(dense_source), dense_target, partial=partial)
+    checks = {"remaining": _ratio(after["chamfer"], aligned["chamfer"])}
+    if inconsistency is not None:
+        checks["inconsistency"] = inconsistency
+    if at_points is not None:
+        moved_by = float(np.linalg.norm(found, axis=1).mean()) * frame.scale
+        checks["uncertain"] = _ratio(float(at_points.mean()), moved_by)
+    trust = assess(calibration, values, expected, checks=checks, notes=notes)
     report: dict[str, Any] = {
         "dine": __version__,
         "source": {"name": source.name, "vertices": len(source.vertices)},
         "target": {"name": target.name, "vertices": len(target.vertices)},
         "before": fit(dense_source, dense_target, partial=partial),
-        "aligned": fit(transformed(dense_source, matrix), dense_target, partial=partial),
-        "after": fit(move(dense_source), dense_target, partial=partial),
+        "aligned": aligned,
+        "after": after,
         "normalised": values,
         "folding": values["folding"],
         "displacement": {
@@ -335,6 +349,7 @@ def _result(
             "verdict": trust.verdict,
             "reasons": list(trust.reasons),
             "percentiles": trust.percentiles,
+            "checks": checks,
             "expected_error": trust.expected_error,
         },
         "alignment": matrix.tolist(),
@@ -413,25 +428,35 @@ def _dense(surface: Surface) -> np.ndarray:
     return sample_surface(surface, 4 * POINTS, rng).carry(surface.vertices)
 
 
-def _check_sizes(source: Surface, target: Surface) -> None:
-    sizes = [
-        float(np.linalg.norm(s.vertices - s.vertices.mean(axis=0), axis=1).mean())
-        for s in (source, target)
-    ]
-    if min(sizes) == 0:
-        raise DataError("All points of the source or of the target coincide.")
+def _check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
+    """What to say of sizes that differ much.
+
+    Raises:
+        DataError: a shape is a single place, or sizes differ so much that units must.
+    """
+    sizes = []
+    for surface, what in ((source, "source"), (target, "target")):
+        middle = surface.vertices.mean(axis=0)
+        sizes.append(float(np.linalg.norm(surface.vertices - middle, axis=1).mean()))
+        if len(surface.vertices) == 1 or sizes[-1] <= 1e-12 * np.abs(middle).max():
+            raise DataError(
+                f"All points of {surface.name}, the {what}, coincide; expected the surface of an "
+                "object."
+            )
     ratio = max(sizes) / min(sizes)
-    if ratio <= _LARGEST_RATIO:
-        return
-    larger = "source" if sizes[0] > sizes[1] else "target"
+    larger, other = (source, target) if sizes[0] > sizes[1] else (target, source)
     units = [text for factor, text in _UNITS.items() if 0.7 < ratio / factor < 1.4]
     guess = (
         f" Perhaps one is in {units[0].replace(' and ', ' and the other in ')}." if units else ""
     )
-    raise DataError(
-        f"The {larger} is {ratio:.3g} times larger than the other; both must be in the same units "
-        f"and show the same object.{guess}"
-    )
+    if ratio > _LARGEST_RATIO:
+        raise DataError(
+            f"{larger.name} is {ratio:.3g} times larger than {other.name}; both must be in the "
+            f"same units and show the same object.{guess}"
+        )
+    if ratio > _UNUSUAL_RATIO and not partial:
+        return [f"{larger.name} is {ratio:.2g} times larger than {other.name}.{guess}"]
+    return []
 
 
 def _aligned(
@@ -468,6 +493,30 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> tuple[np.nda
             "object, or leave out `partial`."
         )
     return carry(places, -back, start), supported
+
+
+def _inconsistency(
+    model: Model,
+    start: np.ndarray,
+    goal: np.ndarray,
+    found: np.ndarray,
+    where: torch.device,
+    rounds: int,
+) -> float:
+    """Mean distance from where they began of points moved to the target and, by the field of the
+    opposite registration, back; normalised frame.
+
+    A wrong correspondence can fit as well as the right one, but is seldom found from both sides.
+    """
+    frame = Frame.of(goal)
+    seen, whole = frame.normalise(goal), frame.normalise(start)
+    back = find_field(model.backbone, seen, whole, where, rounds)[0] * frame.scale
+    places = start + found
+    return float(np.linalg.norm(found + carry(goal, back, places), axis=1).mean())
+
+
+def _ratio(value: float, of: float) -> float:
+    return value / of if of > 0 else 1.0
 
 
 def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:

@@ -63,6 +63,7 @@
   const result = decode(data.result);
   const sourceFaces = data.source.faces && decode(data.source.faces);
   const targetFaces = data.target.faces && decode(data.target.faces);
+  const rows = data.source.rows && decode(data.source.rows); // where a mesh is shown in part
   const scalars = data.scalars.map((scalar) => ({ ...scalar, values: decode(scalar.values) }));
 
   // --- scene --------------------------------------------------------------------------------
@@ -362,7 +363,7 @@
     const place = data.centre.map((middle, axis) => {
       return middle + data.radius * result[3 * vertex + axis];
     });
-    const lines = [`point ${vertex}`, `moved to ${place.map(digits).join(", ")}`];
+    const lines = [`point ${rows ? rows[vertex] : vertex}`, `moved to ${place.map(digits).join(", ")}`];
     for (const { name, unit, values } of scalars) {
       const value = values[vertex];
       lines.push(`${name}: ${Number.isNaN(value) ? "no value" : `${digits(value)} ${unit}`}`);

@@ -17,6 +17,7 @@ import jinja2
 import matplotlib
 import numpy as np
 from markupsafe import Markup
+from scipy.spatial import cKDTree
 
 from dine.data.surface import Surface
 from dine.errors import DataError
@@ -30,6 +31,8 @@ _COLORMAP = "viridis"
 # Values above this share of all are drawn in the last colour if they would stretch the scale.
 _SHOWN = 0.99
 _STRETCH = 1.5
+# Of each shape: more make files that browsers open slowly, and nothing that a screen shows.
+_MOST = 100_000
 
 
 def write_view(
@@ -48,7 +51,9 @@ def write_view(
 
     Shapes with faces are drawn as surfaces, clouds as points. Coordinates keep float32 precision
     about the middle of all shapes. Two meshes of 20,000 vertices and three scalars take 2.5 MB;
-    0.6 MB of it is the viewer, the rest grows with their number.
+    0.6 MB of it is the viewer, the rest grows with their number, up to 13 MB: of larger shapes
+    about 100,000 vertices are drawn, meshes simplified (fast-simplification) and clouds thinned
+    out, and the page says so. Drawn vertices keep their places and numbers.
 
     Args:
         path: the .html file.
@@ -73,13 +78,15 @@ def write_view(
             f"A result of {len(result)} points does not fit a source of {len(source.vertices)}; "
             "expected one row a vertex, in the same order."
         )
+    small, rows = _light(source)
+    small_target, target_rows = _light(target)
     layers = [
-        _layer("moved", "Moved source", source, "#3f7fc4", opacity=100, shown=True),
-        _layer("target", "Target", target, "#8794a3", opacity=35, shown=True),
-        _layer("source", "Source", source, "#d08a3c", opacity=45, shown=False),
+        _layer("moved", "Moved source", source, rows, "#3f7fc4", opacity=100, shown=True),
+        _layer("target", "Target", target, target_rows, "#8794a3", opacity=35, shown=True),
+        _layer("source", "Source", source, rows, "#d08a3c", opacity=45, shown=False),
     ]
     shown = [
-        _scalar(name, values, len(result), (units or {}).get(name, ""))
+        _scalar(name, values, len(result), rows, (units or {}).get(name, ""))
         for name, values in (scalars or {}).items()
     ]
     every = np.concatenate([source.vertices, target.vertices, result])
@@ -92,9 +99,10 @@ def write_view(
     data = {
         "centre": centre.tolist(),
         "radius": radius,
-        "source": _shape(source, normalised),
-        "target": _shape(target, normalised),
-        "result": _array(normalised(result), "float32"),
+        "source": _shape(small, normalised)
+        | {"rows": None if len(small.vertices) == len(result) else _array(rows, "uint32")},
+        "target": _shape(small_target, normalised),
+        "result": _array(normalised(result[rows]), "float32"),
         "scalars": shown,
         "layers": layers,
         "colormap": _colors(),
@@ -120,10 +128,50 @@ def write_view(
     write_text(path, page)
 
 
+def _light(surface: Surface) -> tuple[Surface, np.ndarray]:
+    """A surface of few enough vertices to draw, and which of the original ones (n,) these are."""
+    count = len(surface.vertices)
+    if count <= _MOST:
+        return surface, np.arange(count)
+    if surface.faces is not None:
+        found = _simplified(surface)
+        if found is not None:
+            return found
+    rows = np.sort(np.random.default_rng(0).permutation(count)[:_MOST])
+    return Surface(surface.vertices[rows], name=surface.name), rows
+
+
+def _simplified(surface: Surface) -> tuple[Surface, np.ndarray] | None:
+    """None where the mesh falls into so many parts that it cannot be simplified."""
+    import fast_simplification
+
+    # Vertices of one place, as in STL files, would keep triangles apart.
+    places, corners = np.unique(surface.vertices, axis=0, return_inverse=True)
+    faces = np.ascontiguousarray(corners.reshape(-1)[surface.faces])
+    fewer, faces = fast_simplification.simplify(places, faces, target_count=2 * _MOST)
+    # Nearest original vertices, whose values are known, in place of those that were made.
+    _, rows = cKDTree(surface.vertices).query(fewer)
+    rows, faces = np.unique(rows[faces], return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    if len(faces) == 0 or len(rows) > 1.5 * _MOST:
+        return None
+    return Surface(surface.vertices[rows], faces, name=surface.name), rows
+
+
 def _layer(
-    key: str, name: str, surface: Surface, color: str, *, opacity: int, shown: bool
+    key: str,
+    name: str,
+    surface: Surface,
+    rows: np.ndarray,
+    color: str,
+    *,
+    opacity: int,
+    shown: bool,
 ) -> dict[str, Any]:
     size = f"{len(surface.vertices):,} {'points' if surface.faces is None else 'vertices'}"
+    if len(rows) < len(surface.vertices):
+        size += f", {len(rows):,} of them drawn"
     return {
         "id": key,
         "name": name,
@@ -134,8 +182,10 @@ def _layer(
     }
 
 
-def _scalar(name: str, values: np.ndarray, count: int, unit: str) -> dict[str, Any]:
-    """A scalar with the range of its colour bar and how many values it leaves out."""
+def _scalar(
+    name: str, values: np.ndarray, count: int, rows: np.ndarray, unit: str
+) -> dict[str, Any]:
+    """A scalar with the range of its colour bar and how many of all values it leaves out."""
     values = np.asarray(values, dtype=np.float64)
     if values.shape != (count,):
         raise DataError(
@@ -160,7 +210,7 @@ def _scalar(name: str, values: np.ndarray, count: int, unit: str) -> dict[str, A
         "high": high,
         "over": over,
         "missing": int(count - known.size),
-        "values": _array(np.where(np.isfinite(values), values, np.nan), "float32"),
+        "values": _array(np.where(np.isfinite(values), values, np.nan)[rows], "float32"),
     }
 
 

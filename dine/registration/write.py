@@ -76,8 +76,8 @@ def write_moved(
 ) -> tuple[str, ...]:
     """Write a mesh or cloud in the format that the suffix of ``path`` names.
 
-    ``read_surface`` reads all of them back but VTP, with vertices and faces as given; from
-    STL it gives three vertices a triangle, in the order of the triangles.
+    ``read_surface`` reads all of them back, with vertices and faces as given; from STL it gives
+    three vertices a triangle, in the order of the triangles.
 
     Args:
         path: a file with one of ``SURFACE_SUFFIXES``; missing folders are made.
@@ -296,8 +296,8 @@ def _write_vtp(path: Path, content: _Content) -> None:
 def _vtp(surface: Surface, data: dict[str, np.ndarray]) -> str:
     """VTK's XML PolyData, with arrays as base64 in place.
 
-    Written here because VTK itself is 140 MB, and meshio has no PolyData and, where it is
-    installed, makes trimesh read some thirty more formats, and with it ``read_surface``.
+    Written here because VTK itself unpacks to over 500 MB, and meshio has no PolyData and, where it
+    is installed, makes trimesh read some thirty more formats, and with it ``read_surface``.
     """
     count = len(surface.vertices)
     cells = {"Verts": np.arange(count)[:, None], "Polys": np.empty((0, 3), dtype=np.int64)}

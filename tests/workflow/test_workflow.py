@@ -2,14 +2,23 @@
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from click.testing import CliRunner
+
+from dine.cli import cli
+from dine.data.deformation import rbf_displacement
+from dine.data.readers import read_surface, write_surface
+from dine.data.surface import Surface
+from dine.data.synthetic import primitive
 
 ROOT = Path(__file__).parents[2]
 TINY = "config/tiny.yaml"
@@ -222,3 +231,55 @@ def test_the_dag_can_be_drawn(tmp_path):
     folder = copy_workflow(tmp_path)
     assert snakemake(folder, "all", "--dag").stdout.startswith("digraph")
     assert "stage2_prior" in snakemake(folder, "all", "--rulegraph", "mermaid-js").stdout
+
+
+def commands(page):
+    """Shell commands of a page's blocks, as lists of words."""
+    blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines() if line.strip()]
+    return [shlex.split(line) for line in lines]
+
+
+def test_from_meshes_of_ones_own_to_a_registration(tmp_path, monkeypatch):
+    """The commands of docs/own-organ.md, in a smaller configuration."""
+    folder = copy_workflow(tmp_path)
+    monkeypatch.chdir(folder)
+    organs = folder / "organs"
+    organs.mkdir()
+    for number in range(5):
+        write_surface(organs / f"organ{number}.ply", primitive(number, 0))
+    text = (ROOT / "config" / "own.yaml").read_text()
+    assert text.count("path/to/meshes") == 1
+    (folder / "my.yaml").write_text(text.replace("path/to/meshes", "organs"))
+    small = yaml.safe_load((ROOT / TINY).read_text())
+    pairs = {"recipe": {"levels": [0.2, 0.4]}, "pairs": small["datasets"]["synbench"]["pairs"]}
+    kept = ("priors", "stage1", "stage2", "lambda_search")
+    smaller = {name: small[name] for name in kept} | {"datasets": {"own": pairs}}
+    (folder / "smaller.yaml").write_text(yaml.safe_dump(smaller))
+    page = commands(ROOT / "docs" / "own-organ.md")
+    inspect, check, train, register = page[:4]
+    for command, said in ((inspect, "5 undeformed objects"), (check, "is valid")):
+        words = [word.replace("path/to/meshes", "organs") for word in command]
+        assert words[0] == "dine"
+        done = CliRunner().invoke(cli, words[1:], catch_exceptions=False)
+        assert said in done.output
+    assert train[:4] == ["snakemake", "-j2", "all", "calibrations"]
+    used = dict(zip(register[7::2], register[8::2], strict=True))
+    made = [used[option] for option in ("--weights", "--prior", "--calibration")]
+    jobs = planned(folder, *train[2:], "smaller.yaml")
+    assert jobs["stage1"] == jobs["resample"] == 1
+    # Without tables and figures, which other tests make.
+    snakemake(folder, *made, *train[4:], "smaller.yaml")
+    facts = json.loads(Path(used["--calibration"]).read_text())["facts"]
+    assert facts["resampled"]
+    source = read_surface(organs / "organ0.ply")
+    recipe = {"control_percent": 5, "width": 0.4, "amplitude": 0.1, "points": 256}
+    moved = rbf_displacement(source, level=0.4, rng=np.random.default_rng(0), **recipe)
+    write_surface(folder / "before.ply", source)
+    write_surface(folder / "after.ply", Surface(source.vertices + moved, source.faces))
+    done = CliRunner().invoke(cli, register[1:], catch_exceptions=False)
+    assert done.exit_code == 0
+    report = json.loads((folder / "moved.json").read_text())
+    assert report["after"]["chamfer"] < 0.5 * report["before"]["chamfer"]
+    assert report["trust"]["expected_error"] > 0
+    assert (folder / "moved.html").is_file()
