@@ -929,17 +929,11 @@ def calibrate(model, pairs, targets, prior, device, out):
     pca.safetensors --out calibration.json
     """
     from dine.registration.calibration import calibrate as run
-    from dine.training.parallel import chosen_device
+    from dine.training.devices import chosen_device, leased
 
     _start_torch()
-    run(
-        model,
-        list(pairs),
-        out,
-        targets=list(targets),
-        prior=prior,
-        device=chosen_device(device),
-    )
+    with leased(chosen_device(device)) as [found]:
+        run(model, list(pairs), out, targets=list(targets), prior=prior, device=found)
 
 
 def main() -> None:

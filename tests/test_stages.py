@@ -193,7 +193,7 @@ def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, 
 
 def test_one_of_several_processes_dies(chain, tmp_path):
     command, process = start_training(chain, tmp_path, 2)
-    leader = int((tmp_path / "training" / "holder.txt").read_text().split()[-1])
+    leader = int((tmp_path / "training" / "lock.holder").read_text().split()[-1])
     assert leader != process.pid
     os.kill(leader, signal.SIGKILL)
     error = process.communicate(timeout=60)[1]

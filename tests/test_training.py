@@ -17,8 +17,8 @@ from dine.models.backbones import Backbone, Registration
 from dine.priors import PRIORS
 from dine.training import loop
 from dine.training.data_terms import DATA_TERMS
+from dine.training.devices import chosen_device
 from dine.training.objective import Objective
-from dine.training.parallel import chosen_device
 from dine.training.stages import new_backbone
 from dine.training.state import Interrupted, one_writer
 

@@ -31,7 +31,7 @@ from dine.registration.carry import carry
 from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
 from dine.registration.refine import ROUNDS, refine
 from dine.registration.trust import Trust, assess
-from dine.training.parallel import chosen_device
+from dine.training.devices import chosen_device
 from dine.training.stages import WEIGHTS, shipped_weights
 
 log = logging.getLogger(__name__)

@@ -29,8 +29,9 @@ from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import Backbone
 from dine.progress import Progress
+from dine.training.devices import chosen_device, leased
 from dine.training.objective import Loss, Objective
-from dine.training.parallel import Alone, Team, chosen_device, run_together
+from dine.training.parallel import Alone, Team, run_together
 from dine.training.state import Interrupted, StopRequest, load_state, one_writer, save_state
 
 log = logging.getLogger(__name__)
@@ -134,8 +135,8 @@ def train(
         train_targets: (P, M, 3), stand in for the training pairs' own targets.
         val_targets: likewise for the validation pairs.
         device: ``auto``, ``cpu`` or ``cuda``.
-        processes: that share every batch; on CUDA each has a device of its own. Their number
-            changes the result by rounding only, and is no part of the identity.
+        processes: that share every batch, on all nodes together; on CUDA each has a device of its
+            own. Their number changes the result by rounding only, and is no part of the identity.
         on_step: called after each step (tests interrupt there).
 
     Returns:
@@ -169,10 +170,11 @@ def train(
         name=name,
         on_step=on_step,
     )
+    chosen = chosen_device(device)
     if processes == 1:
-        with StopRequest() as stop:
-            return work(Alone(chosen_device(device), stop))
-    run_together(processes, chosen_device(device), work)
+        with leased(chosen) as devices, StopRequest() as stop:
+            return work(Alone(devices[0], stop))
+    run_together(processes, chosen, work)
     state, _ = load_state(folder / STATE, identity)
     backbone.load_state_dict(state["model"])
     return state["history"]
@@ -284,4 +286,5 @@ def _train(
                         f"{name} was stopped after step {step + 1} of {settings.steps}; run the "
                         "same command again to go on from there."
                     )
+    team.wait()  # until the last state is saved, which other nodes read
     return history

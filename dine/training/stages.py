@@ -32,9 +32,9 @@ from dine.priors import PRIORS, load_prior
 from dine.progress import Progress
 from dine.provenance import code_digest, run_record
 from dine.training.data_terms import DATA_TERMS
+from dine.training.devices import chosen_device, leased
 from dine.training.loop import VALIDATION_COLUMNS, history_csv, train
 from dine.training.objective import Objective
-from dine.training.parallel import chosen_device
 
 log = logging.getLogger(__name__)
 
@@ -252,17 +252,19 @@ def predict_fields(
     ``targets`` (P, M, 3) stands in for the clean targets. Each target's points come in a shuffled
     order, as in training.
     """
-    device = chosen_device(compute.device)
     backbone.precision = compute.precision
-    backbone.to(device).eval()
-    batches = Batches(pairs, device, targets)
     fields = np.empty(pairs.source.shape, np.float32)
     spread = np.full(pairs.source.shape[:2], np.nan, np.float32)
     seconds = np.empty(len(pairs))
     starts = range(0, len(pairs), batch_size)
     parts = [np.arange(start, min(start + batch_size, len(pairs))) for start in starts]
-    stream = batches.stream((part, [(2, index) for index in part]) for part in parts)
-    with contextlib.closing(stream), Progress(name, len(pairs), unit="pair") as progress:
+    requests = ((part, [(2, index) for index in part]) for part in parts)
+    with (
+        leased(chosen_device(compute.device)) as [device],
+        contextlib.closing(Batches(pairs, device, targets).stream(requests)) as stream,
+        Progress(name, len(pairs), unit="pair") as progress,
+    ):
+        backbone.to(device).eval()
         for part, (batch, _) in zip(parts, stream, strict=True):
             began = time.perf_counter()
             found = backbone(batch)

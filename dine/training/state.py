@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import pickle
 import signal
 import threading
@@ -11,11 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import filelock
 import torch
 
 from dine.errors import DineError
-from dine.files import atomic_path
+from dine.files import atomic_path, held
 
 
 class Interrupted(DineError):
@@ -26,27 +24,16 @@ class Interrupted(DineError):
 def one_writer(folder: Path) -> Iterator[None]:
     """Hold a run folder; a second process that wants it is refused.
 
-    The operating system lets go of the lock when the holder dies, however it dies.
-
     Raises:
         DineError: another process is training in the folder.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    holder = folder / "holder.txt"
-    lock = filelock.FileLock(folder / "lock", timeout=0)
-    try:
-        lock.acquire()
-    except filelock.Timeout:
-        who = holder.read_text().strip() if holder.exists() else "another process"
-        raise DineError(
-            f"{folder} is in use by {who}; wait for it or stop it, then run the same command again."
-        ) from None
-    try:
-        holder.write_text(f"process {os.getpid()}\n")
+    with held(folder / "lock") as who:
+        if who:
+            raise DineError(
+                f"{folder} is in use by {who}; wait for it or stop it, then run the same command "
+                "again."
+            )
         yield
-    finally:
-        holder.unlink(missing_ok=True)
-        lock.release()
 
 
 class StopRequest:

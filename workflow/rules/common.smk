@@ -49,6 +49,8 @@ THREADS = CONFIG.threads
 # A training is one job, whatever the number of its processes. Their number changes results by
 # rounding only, so it is a resource and no parameter: nothing finished is made again for it.
 PROCESSES = CONFIG.processes
+# Kinds of jobs that compute on CONFIG.device, and in how many processes.
+ON_DEVICE = {"training": PROCESSES, "prediction": 1}
 COMPUTE = f"--device {CONFIG.device} --precision {CONFIG.precision}"
 
 # Where rule logs, benchmarks and the run folder of a method lie.
@@ -77,6 +79,24 @@ wildcard_constraints:
 def section(model):
     """One narrow section of the configuration as text, for a rule's params and command line."""
     return json.dumps(model.model_dump(mode="json", exclude_none=True), sort_keys=True)
+
+
+def whole_config():
+    """All of the configuration that can change a result, as text."""
+    everywhere = {"resources": dine_config.Resources()}
+    return section(CONFIG.model_copy(update=everywhere))
+
+
+def request(kind):
+    """Resources of a kind of job. Locally only `gpu` is counted; a cluster is asked for all."""
+    asked = getattr(CONFIG.resources, kind)
+    processes = ON_DEVICE.get(kind, 1)
+    return {
+        "mem_mb": asked.memory_mb * processes,
+        "runtime": asked.minutes,
+        "gpu": GPUS * processes if kind in ON_DEVICE else 0,
+        "processes": processes,
+    }
 
 
 def options(flag, *columns):

@@ -31,6 +31,8 @@ rule evidence_raw:
         EVIDENCE_LOGS / "{dataset}" / "raw.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=evidence_raw_settings,
         first=FIRST_TEST_OBJECT,
@@ -50,6 +52,8 @@ rule evidence_pairs:
         EVIDENCE_LOGS / "{dataset}" / "pairs.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=lambda wildcards: section(CONFIG.datasets[wildcards.dataset].pairs),
         seed=CONFIG.seed,
@@ -70,6 +74,8 @@ rule evidence_corrupt:
         condition="noise|outliers",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         levels=options("--at", CONFIG.evidence.at_levels),
         seed=CONFIG.seed,
@@ -89,6 +95,8 @@ rule evidence_resample:
         EVIDENCE_LOGS / "{dataset}" / "variants" / "resampled_1.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         levels=options("--at", CONFIG.evidence.at_levels),
         seed=CONFIG.seed,
@@ -115,8 +123,7 @@ rule evidence_lambda:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         stage2=method_stage2,
         settings=evidence_search,
@@ -145,8 +152,7 @@ rule stage2_method:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         prior=method_prior_options,
         settings=method_stage2,
@@ -184,7 +190,7 @@ rule evidence_predict:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
@@ -218,6 +224,8 @@ rule evidence_refine:
     conda:
         "../envs/dine.yaml"
     threads: THREADS
+    resources:
+        **request("registration"),
     params:
         variants=variant_options,
         prior=refined_prior_options,
@@ -241,6 +249,8 @@ rule evidence_classical:
     conda:
         "../envs/dine.yaml"
     threads: THREADS
+    resources:
+        **request("registration"),
     params:
         variants=variant_options,
         algorithm=lambda wildcards: CONFIG.evidence.methods[
@@ -270,6 +280,8 @@ rule evidence_evaluate:
         group=f"none|{EVERY_BACKBONE}",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("evaluation"),
     params:
         variants=variant_options,
         runs=group_options,
@@ -293,6 +305,8 @@ rule evidence_diagnose:
         EVIDENCE_LOGS / "diagnostics" / "{dataset}" / "{backbone}" / "{prior}.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("prior"),
     params:
         seed=CONFIG.seed,
         code=code_digest("priors", "reporting"),
@@ -317,11 +331,13 @@ rule evidence:
         EVIDENCE_LOGS / "report.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("reporting"),
     params:
         searches=lambda wildcards, input: options("--search", input.searches),
         diagnostics=lambda wildcards, input: options("--diagnostics", input.diagnostics),
         methods=evidence_method_texts(),
-        settings=section(CONFIG),
+        settings=whole_config(),
         code=code_digest("reporting", "evaluation"),
     shell:
         "dine --log {log:q} evidence {input.metrics:q} {params.searches} {params.diagnostics}"

@@ -15,7 +15,7 @@ rule calibrate:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         prior=lambda wildcards, input: options("--prior", input.prior),
         device=CONFIG.device,
