@@ -286,7 +286,7 @@ def _take_part(
         "OMP_NUM_THREADS": str(threads),  # else Fabric sets its own number
     }
     torch.set_num_threads(threads)
-    if rank == 0:
+    if rank == 0 and nodes.rank == 0:
         logging.getLogger().setLevel(level)
         logging.getLogger().addHandler(_ToParent(writer))
     try:

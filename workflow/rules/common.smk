@@ -15,8 +15,8 @@ from dine.results import (
     Results,
     backbone_and_seed,
     conditions,
-    evidence_cells,
     evidence_conditions,
+    evidence_groups,
     evidence_names,
     figure_names,
     pca_priors,
@@ -35,6 +35,8 @@ FILES = Results(RESULTS)
 FIGURES = figure_names(CONFIG)
 TABLES = table_names(CONFIG)
 RUNS = runs(CONFIG)
+# Once: to look through all of them for each job would take minutes for thousands of jobs.
+GROUPS = evidence_groups(CONFIG)
 
 # Rules call the `dine` that belongs to the Python that runs Snakemake.
 shell.prefix(
@@ -91,12 +93,12 @@ def request(kind):
     """Resources of a kind of job. Locally only `gpu` is counted; a cluster is asked for all."""
     asked = getattr(CONFIG.resources, kind)
     processes = ON_DEVICE.get(kind, 1)
-    return {
-        "mem_mb": asked.memory_mb * processes,
-        "runtime": asked.minutes,
-        "gpu": GPUS * processes if kind in ON_DEVICE else 0,
-        "processes": processes,
-    }
+    found = {"mem_mb": asked.memory_mb * processes, "runtime": asked.minutes}
+    if kind in ON_DEVICE:
+        found["processes"] = processes
+        if GPUS:  # some executors ask for a GPU wherever the word stands, be it with 0
+            found["gpu"] = GPUS * processes
+    return found
 
 
 def options(flag, *columns):
@@ -298,8 +300,7 @@ def refined_prior_options(wildcards, input):
 
 
 def group_cells(wildcards):
-    group = (wildcards.dataset, wildcards.group, int(wildcards.seed))
-    return [cell for cell in evidence_cells(CONFIG) if cell[:3] == group]
+    return GROUPS[wildcards.dataset, wildcards.group, int(wildcards.seed)]
 
 
 def group_predictions(wildcards):
@@ -323,10 +324,9 @@ def group_options(wildcards, input):
 
 
 def evidence_metrics():
-    groups = dict.fromkeys(cell[:3] for cell in evidence_cells(CONFIG))
     return [
         FILES.evidence(dataset, backbone, f"seed{seed}", "metrics.csv")
-        for dataset, backbone, seed in groups
+        for dataset, backbone, seed in GROUPS
     ]
 
 
