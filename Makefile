@@ -5,7 +5,7 @@ PYTHON ?= python3
 JOBS ?= 2
 BIN := .venv/bin
 
-.PHONY: run tiny test kill-test check format docs wheel-check
+.PHONY: run tiny test kill-test check format docs wheel-check slurm-test
 
 run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
@@ -43,6 +43,10 @@ docs: .venv/installed
 # The package as a user installs it, in an environment of its own outside the checkout.
 wheel-check:
 	PYTHON=$(PYTHON) .ci/wheel
+
+# The workflow through Slurm, which is installed and started for it: Debian or Ubuntu, and root.
+slurm-test: .venv/installed
+	.ci/slurm
 
 .venv/installed: requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=")'

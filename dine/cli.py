@@ -959,18 +959,12 @@ def calibrate(model, pairs, targets, prior, device, out):
     Example: dine calibrate --model model.safetensors --pairs pairs.h5 --targets resampled.h5
     --prior pca.safetensors --out calibration.json
     """
-    from dine.models.inference import chosen_device
+    from dine.models.devices import chosen_device, leased
     from dine.registration.calibration import calibrate as run
 
     _start_torch()
-    run(
-        model,
-        list(pairs),
-        out,
-        targets=list(targets),
-        prior=prior,
-        device=chosen_device(device),
-    )
+    with leased(chosen_device(device)) as [found]:
+        run(model, list(pairs), out, targets=list(targets), prior=prior, device=found)
 
 
 def main() -> None:

@@ -407,6 +407,47 @@ class Evidence(Section):
     """Methods whose fields are drawn for typical pairs; those of the first one are typical."""
 
 
+class Request(Section):
+    """What a job of some kind asks a cluster for; cores and GPUs follow from `threads`, `processes`
+    and `device`."""
+
+    memory_mb: Count = 2000
+    """Megabytes of main memory, for each process of the job."""
+    minutes: Count = 60
+    """Longest time; a training that it ends goes on from its saved state when it is run again."""
+
+
+class TrainingRequest(Request):
+    memory_mb: Count = 4000
+    """Megabytes of main memory, for each process of the job."""
+    minutes: Count = 720
+    """Longest time; a training that it ends goes on from its saved state when it is run again."""
+
+
+class PriorRequest(Request):
+    memory_mb: Count = 8000
+    """Megabytes of main memory: some six times the size of the file of fields."""
+
+
+class Resources(Section):
+    """What each kind of job asks a cluster for; without one it has no effect (docs/cluster.md)."""
+
+    data: Request = Request()
+    """Raw meshes, pairs, corrupted and resampled targets."""
+    training: TrainingRequest = TrainingRequest()
+    """Stage 1, Stage 2, the search of λ, pretraining."""
+    prediction: Request = Request()
+    """Networks applied to pairs: fields, predictions, calibrations."""
+    prior: PriorRequest = PriorRequest()
+    """Fits of priors, and their diagnostics."""
+    registration: Request = Request(minutes=240)
+    """Classical methods and refinement at test time."""
+    evaluation: Request = Request()
+    """Metrics from predictions."""
+    reporting: Request = Request()
+    """Tables, figures, reports."""
+
+
 class Compute(Section):
     """How a step computes, which is the same for all of them."""
 
@@ -427,6 +468,7 @@ class Config(Compute):
     """Seed of data, initial weights and training order."""
     threads: Count = 1
     """Threads of each process of a training or prediction; Snakemake's -j shares them out."""
+    resources: Resources = Resources()
     datasets: dict[str, Dataset] = Field(default={}, min_length=1)
     backbones: dict[str, BackboneConfig] = Field(default={}, min_length=1)
     priors: dict[str, PriorConfig] = Field(default={}, min_length=1)

@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import filelock
+
 from dine.errors import DataError, StorageError
 
 # Less free space than one block of a file system: taken for a full disk when a write failed.
@@ -120,6 +122,38 @@ def _storage_error(error: Exception, path: Path, folder: Path) -> Exception:
         f"Could not write {path}: {reason}; free space or choose another folder, then run the "
         "same command again."
     )
+
+
+@contextlib.contextmanager
+def held(lock: Path, *, again: bool = False) -> Iterator[str | None]:
+    """Take a lock without waiting; yield None when it is ours, otherwise who holds it.
+
+    The operating system lets go of the lock when the holder dies, however it dies. With ``again``
+    this process may take a lock that it holds already.
+
+    Raises:
+        StorageError: the folder cannot be written.
+    """
+    holder = lock.with_name(f"{lock.name}.holder")
+    taken = filelock.FileLock(lock, timeout=0, is_singleton=again)
+    try:
+        with storage_errors(lock.parent):
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            taken.acquire()
+    except filelock.Timeout:
+        who = ""
+        with contextlib.suppress(FileNotFoundError):
+            who = holder.read_text().strip()
+        yield who or "another process"
+        return
+    try:
+        with storage_errors(lock.parent):
+            holder.write_text(f"process {os.getpid()} on {platform.node()}\n")
+        yield None
+    finally:
+        if taken.lock_counter == 1:
+            holder.unlink(missing_ok=True)
+        taken.release()
 
 
 def _storage_reason(error: Exception, folder: Path) -> str | None:

@@ -114,6 +114,14 @@ def evidence_cells(config: Config) -> list[Cell]:
     return cells
 
 
+def evidence_groups(config: Config) -> dict[tuple[str, str, int], list[Cell]]:
+    """The evaluations that one job makes together, by (dataset, backbone, seed)."""
+    groups: dict[tuple[str, str, int], list[Cell]] = {}
+    for cell in evidence_cells(config):
+        groups.setdefault(cell[:3], []).append(cell)
+    return groups
+
+
 def evidence_conditions(config: Config, dataset: str) -> list[tuple[str, float]]:
     """The corrupted conditions of the evidence, and that of targets with other points.
 

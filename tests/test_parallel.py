@@ -14,7 +14,7 @@ from dine.models.backbones import Backbone, Registration
 from dine.training import loop, parallel
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
-from dine.training.state import Interrupted, one_writer
+from dine.training.state import Interrupted, load_state, one_writer
 
 ROUNDING = 1e-5
 """Of what was learned: float32 gradients agree to some 1e-7, and Adam's steps are their ratios."""
@@ -88,6 +88,61 @@ def test_another_number_of_processes_goes_on_from_the_state(alone, tmp_path, bef
     weights, history = run(tmp_path, after)
     assert difference(weights, alone[0]) < ROUNDING * difference(Mover().state_dict(), alone[0])
     assert [row["step"] for row in history] == list(range(1, 9))
+
+
+ON_A_NODE = "import pathlib, sys, test_parallel; test_parallel.run(pathlib.Path(sys.argv[1]), 2)"
+
+
+def slurm(monkeypatch, **facts):
+    """The variables of a step that `srun` has started."""
+    found = {"STEP_NUM_NODES": 2, "STEP_NUM_TASKS": 2, "STEP_NODELIST": "gpu[07-09],x", "NODEID": 0}
+    for name, value in (found | {"JOB_ID": 8001} | facts).items():
+        monkeypatch.setenv(f"SLURM_{name}", str(value))
+
+
+def test_two_nodes_train_as_one_process_does(alone, tmp_path, monkeypatch):
+    monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
+    monkeypatch.setenv("MASTER_PORT", str(parallel._free_port()))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(__file__), *sys.path]))
+    nodes = []
+    for number in range(2):
+        slurm(monkeypatch, NODEID=number)
+        nodes.append(subprocess.Popen([sys.executable, "-c", ON_A_NODE, str(tmp_path)]))
+    assert [node.wait(timeout=300) for node in nodes] == [0, 0]
+    state, _ = load_state(tmp_path / loop.STATE, IDENTITY)
+    scale = difference(Mover().state_dict(), alone[0])
+    assert difference(state["model"], alone[0]) < ROUNDING * scale
+    assert [row["step"] for row in state["history"]] == list(range(1, 9))
+
+
+def test_nodes_as_slurm_tells_them(monkeypatch):
+    for name in ("MASTER_ADDR", "MASTER_PORT", "SLURM_STEP_NUM_NODES"):
+        monkeypatch.delenv(name, raising=False)
+    assert parallel.nodes_here() == (1, 0, "127.0.0.1", None)
+    slurm(monkeypatch, NODEID=1)
+    first, second = parallel.nodes_here(), parallel.nodes_here()
+    assert first[:3] == (2, 1, "gpu07")
+    # The next training of the same command does not meet the last one's processes.
+    assert second.port == first.port + 1
+    slurm(monkeypatch, STEP_NUM_NODES=1)
+    assert parallel.nodes_here().count == 1
+
+
+@pytest.mark.parametrize(
+    ("nodes", "first"),
+    [("gpu[07-09,12]", "gpu07"), ("a1,b2", "a1"), ("n[3,5]", "n3"), ("alone", "alone")],
+)
+def test_the_first_host_of_a_list(nodes, first):
+    assert parallel.first_host(nodes) == first
+
+
+def test_nodes_that_cannot_share(monkeypatch):
+    slurm(monkeypatch, STEP_NUM_TASKS=8)
+    with pytest.raises(ConfigError, match="started 8 tasks on 2 nodes"):
+        parallel.run_together(2, torch.device("cpu"), print)
+    slurm(monkeypatch)
+    with pytest.raises(ConfigError, match="`processes` is 3, which 2 nodes cannot share"):
+        parallel.run_together(3, torch.device("cpu"), print)
 
 
 def test_errors_of_the_processes_are_the_users(tmp_path):

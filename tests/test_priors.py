@@ -220,10 +220,12 @@ def test_linear_gaussian_models_have_the_covariance_of_the_samples(name):
     assert np.abs(samples.mean(0) - model.mean.ravel()).max() < 0.05 * np.sqrt(covariance.max())
 
 
-def test_pca_penalty_follows_the_papers_equations():
-    fields = smooth_fields(30) + 0.01 * np.random.default_rng(1).normal(size=(30, POINTS, 3))
+@pytest.mark.parametrize("count", [30, 90])  # fewer and more than coordinates
+def test_pca_penalty_follows_the_papers_equations(count):
+    noise = 0.01 * np.random.default_rng(1).normal(size=(count, POINTS, 3))
+    fields = smooth_fields(count) + noise
     prior = PRIORS.get("pca").fit(fields, components=5).double()
-    flat = fields.reshape(30, -1)
+    flat = fields.reshape(count, -1)
     mu, sigma = flat.mean(0), flat.std(0)
     normalised = (flat - mu) / (sigma + 1e-6)
     _, _, rows = np.linalg.svd(normalised, full_matrices=False)

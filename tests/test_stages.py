@@ -160,7 +160,7 @@ def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, 
 
 def test_one_of_several_processes_dies(chain, tmp_path):
     command, process = start_training(chain, tmp_path, 2)
-    leader = int((tmp_path / "training" / "holder.txt").read_text().split()[1])
+    leader = int((tmp_path / "training" / "lock.holder").read_text().split()[1])
     assert leader != process.pid
     os.kill(leader, signal.SIGKILL)
     error = process.communicate(timeout=60)[1]
@@ -178,7 +178,7 @@ def test_an_orphan_holds_its_folder_until_it_ends(chain, tmp_path):
     wait_for(out / "training" / "state.pt")
     started.kill()  # as Snakemake may be; its training does not notice
     started.wait()
-    holder = out / "training" / "holder.txt"
+    holder = out / "training" / "lock.holder"
     number = int(holder.read_text().split()[1])
     try:
         refused = subprocess.run(command, stderr=subprocess.PIPE, text=True)

@@ -14,7 +14,7 @@ from dine.data.loading import Batches
 from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
 from dine.models.backbones import Backbone, Registration
-from dine.models.inference import chosen_device
+from dine.models.devices import chosen_device
 from dine.priors import PRIORS
 from dine.training import loop
 from dine.training.data_terms import DATA_TERMS

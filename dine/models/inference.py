@@ -14,26 +14,13 @@ from dine.config import Compute
 from dine.data.fields import TrainingFields, write_training_fields
 from dine.data.loading import Batches
 from dine.data.pairs import PairSet, read_seen
-from dine.errors import DineError
 from dine.files import file_digest
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.models.checkpoint import load_backbone
+from dine.models.devices import chosen_device, leased
 from dine.progress import Progress
 
 COMPUTE = Compute()
-
-
-def chosen_device(name: str) -> torch.device:
-    """``auto``, ``cpu`` or ``cuda`` as a device.
-
-    Raises:
-        DineError: ``cuda`` where there is none.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise DineError("The device 'cuda' was asked for, but no CUDA device is available here.")
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
 
 
 class Fields(NamedTuple):
@@ -63,17 +50,19 @@ def predict_fields(
     ``targets`` (P, M, 3) stands in for the clean targets. Each target's points come in a shuffled
     order, as in training.
     """
-    device = chosen_device(compute.device)
     backbone.precision = compute.precision
-    backbone.to(device).eval()
-    batches = Batches(pairs, device, targets)
     fields = np.empty(pairs.source.shape, np.float32)
     spread = np.full(pairs.source.shape[:2], np.nan, np.float32)
     seconds = np.empty(len(pairs))
     starts = range(0, len(pairs), batch_size)
     parts = [np.arange(start, min(start + batch_size, len(pairs))) for start in starts]
-    stream = batches.stream((part, [(2, index) for index in part]) for part in parts)
-    with contextlib.closing(stream), Progress(name, len(pairs), unit="pair") as progress:
+    requests = ((part, [(2, index) for index in part]) for part in parts)
+    with (
+        leased(chosen_device(compute.device)) as [device],
+        contextlib.closing(Batches(pairs, device, targets).stream(requests)) as stream,
+        Progress(name, len(pairs), unit="pair") as progress,
+    ):
+        backbone.to(device).eval()
         for part, (batch, _) in zip(parts, stream, strict=True):
             began = time.perf_counter()
             found = backbone(batch)

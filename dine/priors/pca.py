@@ -82,8 +82,10 @@ class PCAPrior(Prior):
         normalised = (flat - mean) / scale
         if not normalised.any():
             raise DataError("All displacement fields are equal; a prior cannot be fitted to them.")
-        # The deterministic solver: results must not depend on a random projection.
-        pca = PCA(n_components=kept, svd_solver="full").fit(normalised)
+        # Deterministic solvers: results must not depend on a random projection. With more fields
+        # than coordinates, their covariance is the smaller matrix by far.
+        solver = "full" if len(flat) <= flat.shape[1] else "covariance_eigh"
+        pca = PCA(n_components=kept, svd_solver=solver).fit(normalised)
         latent = normalised @ pca.components_.T
         covariance = shrunk_covariance(empirical_covariance(latent), shrinkage)
         covariance += epsilon_covariance * np.eye(kept)

@@ -21,7 +21,7 @@ from dine.errors import ConfigError, DataError
 from dine.evaluation.quality import distances, fit, folding, landmark_errors
 from dine.files import file_digest
 from dine.models.checkpoint import load_backbone
-from dine.models.inference import chosen_device
+from dine.models.devices import chosen_device
 from dine.priors import load_prior
 from dine.registration.calibration import (
     Calibration,

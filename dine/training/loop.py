@@ -28,7 +28,7 @@ from dine.evaluation.quality import roughness
 from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import Backbone
-from dine.models.inference import chosen_device
+from dine.models.devices import chosen_device, leased
 from dine.progress import Progress
 from dine.training.objective import Loss, Objective
 from dine.training.parallel import Alone, Team, run_together
@@ -141,8 +141,8 @@ def train(
         train_targets: (P, M, 3), stand in for the training pairs' own targets.
         val_targets: likewise for the validation pairs.
         device: ``auto``, ``cpu`` or ``cuda``.
-        processes: that share every batch; on CUDA each has a device of its own. Their number
-            changes the result by rounding only, and is no part of the identity.
+        processes: that share every batch, on all nodes together; on CUDA each has a device of its
+            own. Their number changes the result by rounding only, and is no part of the identity.
         on_step: called after each step (tests interrupt there).
 
     Returns:
@@ -176,10 +176,11 @@ def train(
         name=name,
         on_step=on_step,
     )
+    chosen = chosen_device(device)
     if processes == 1:
-        with StopRequest() as stop:
-            return work(Alone(chosen_device(device), stop))
-    run_together(processes, chosen_device(device), work)
+        with leased(chosen) as devices, StopRequest() as stop:
+            return work(Alone(devices[0], stop))
+    run_together(processes, chosen, work)
     state, _ = load_state(folder / STATE, identity)
     backbone.load_state_dict(state["model"])
     return state["history"]
@@ -293,4 +294,5 @@ def _train(
                         f"{name} was stopped after step {step + 1} of {settings.steps}; run the "
                         "same command again to go on from there."
                     )
+    team.wait()  # until the last state is saved, which other nodes read
     return history

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import itertools
 import logging
 import logging.handlers
 import multiprocessing
 import os
 import pickle
+import re
 import signal
 import socket
 import threading
 from collections.abc import Callable
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -26,10 +28,57 @@ from torch.multiprocessing import (
 )
 
 from dine.errors import ConfigError, DineError
+from dine.models.devices import leased
 from dine.training.state import Interrupted, StopRequest
 
 GRACE_SECONDS = 5.0
 """How long the others may take to notice that one process has died, before they are ended."""
+
+
+class Nodes(NamedTuple):
+    """The machines that a training runs on: the same command, started once on each of them."""
+
+    count: int = 1
+    rank: int = 0
+    address: str = "127.0.0.1"
+    """Of the first one, where all processes meet."""
+    port: int | None = None
+    """There; None for any that is free, where there is one machine."""
+
+
+_trainings = itertools.count()
+
+
+def nodes_here() -> Nodes:
+    """The machines as ``srun --ntasks-per-node=1`` tells them; one machine otherwise.
+
+    MASTER_ADDR and MASTER_PORT say where processes meet, in place of the first node and a port that
+    follows from the job's number.
+
+    Raises:
+        ConfigError: several tasks on a node.
+    """
+    found = os.environ
+    count = int(found.get("SLURM_STEP_NUM_NODES", 1))
+    if count == 1:
+        return Nodes()
+    tasks = int(found.get("SLURM_STEP_NUM_TASKS", count))
+    if tasks != count:
+        raise ConfigError(
+            f"`srun` started {tasks} tasks on {count} nodes; start one on each "
+            "(--ntasks-per-node=1) and let --processes say how many processes they have together."
+        )
+    # Trainings follow one another in one command, and the last one's port may still be in use.
+    port = int(found.get("MASTER_PORT") or 20000 + int(found["SLURM_JOB_ID"]) % 8000)
+    port += next(_trainings)
+    address = found.get("MASTER_ADDR") or first_host(found["SLURM_STEP_NODELIST"])
+    return Nodes(count, int(found["SLURM_NODEID"]), address, port)
+
+
+def first_host(nodes: str) -> str:
+    """The first of Slurm's list of hosts, such as ``gpu[07-09,12]`` or ``a1,b2``."""
+    name, _, numbers = re.match(r"([^\[,]+)(\[([^\],-]+))?", nodes).groups(default="")
+    return name + (numbers or "")
 
 
 class Alone:
@@ -64,14 +113,16 @@ class Member:
     The first one leads: it alone writes, validates and shows progress.
     """
 
-    def __init__(self, count: int, device: torch.device, stop: Any):
+    def __init__(self, devices: list[torch.device], nodes: Nodes, stop: Any):
         from lightning_fabric import Fabric
         from lightning_fabric.plugins.environments import LightningEnvironment
 
         logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
         self._fabric = Fabric(
-            accelerator=device.type,
-            devices=count,
+            accelerator=devices[0].type,
+            # Fabric takes a number of CPU processes, but indices of CUDA devices.
+            devices=[d.index for d in devices] if devices[0].type == "cuda" else len(devices),
+            num_nodes=nodes.count,
             strategy="ddp",
             # Whatever cluster this runs on, our own parent has started us.
             plugins=[LightningEnvironment()],
@@ -106,34 +157,43 @@ def run_together(count: int, device: torch.device, work: Callable[[Team], Any]) 
     """Call ``work`` in ``count`` new processes, each with its own :class:`Member`.
 
     SIGTERM and SIGINT to this process, and its death, make them all stop after the same step. When
-    one of them dies the others are ended.
+    one of them dies the others are ended. On several nodes this is called on each of them, and
+    starts that node's share of the processes.
 
     Args:
-        count: number of processes; on CUDA each takes a device of its own.
+        count: number of processes, on all nodes; on CUDA each takes a device of its own.
         device: its type is what counts.
         work: can be pickled; its result is dropped, so it leaves what it makes in files.
 
     Raises:
         DineError: what ``work`` raised, or a process died.
-        ConfigError: more processes than CUDA devices, or Lightning Fabric is not installed.
+        ConfigError: more processes than CUDA devices, nodes cannot share the processes equally, or
+            Lightning Fabric is not installed.
     """
     if importlib.util.find_spec("lightning_fabric") is None:
         raise ConfigError(
             "More than one process needs Lightning Fabric: pip install lightning-fabric, or set "
             "`processes` to 1."
         )
-    if device.type == "cuda" and count > torch.cuda.device_count():
+    nodes = nodes_here()
+    if count % nodes.count:
         raise ConfigError(
-            f"`processes` is {count}, and each needs a device of its own, but the number of CUDA "
-            f"devices here is {torch.cuda.device_count()}."
+            f"`processes` is {count}, which {nodes.count} nodes cannot share equally; make it a "
+            "multiple of the number of nodes."
         )
+    with leased(device, count // nodes.count) as devices:
+        _start(devices, nodes, work)
+
+
+def _start(devices: list[torch.device], nodes: Nodes, work: Callable[[Team], Any]) -> None:
+    """Start this node's processes and stay until they have ended."""
+    count = len(devices)
     context = multiprocessing.get_context("spawn")
     stop = context.RawValue("b", 0)
     reader, writer = context.Pipe(duplex=False)
     arguments = (
-        count,
-        device,
-        _free_port(),
+        devices,
+        nodes if nodes.port else nodes._replace(port=_free_port()),
         max(1, torch.get_num_threads() // count),
         stop,
         writer,
@@ -209,9 +269,8 @@ class _ToParent(logging.handlers.QueueHandler):
 
 def _take_part(
     rank: int,
-    count: int,
-    device: torch.device,
-    port: int,
+    devices: list[torch.device],
+    nodes: Nodes,
     threads: int,
     stop: Any,
     writer: Connection,
@@ -220,18 +279,18 @@ def _take_part(
 ) -> None:
     """What each process runs."""
     os.environ |= {
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
+        "MASTER_ADDR": nodes.address,
+        "MASTER_PORT": str(nodes.port),
         "LOCAL_RANK": str(rank),
-        "NODE_RANK": "0",
+        "NODE_RANK": str(nodes.rank),
         "OMP_NUM_THREADS": str(threads),  # else Fabric sets its own number
     }
     torch.set_num_threads(threads)
-    if rank == 0:
+    if rank == 0 and nodes.rank == 0:
         logging.getLogger().setLevel(level)
         logging.getLogger().addHandler(_ToParent(writer))
     try:
-        pickle.loads(work)(Member(count, device, stop))
+        pickle.loads(work)(Member(devices, nodes, stop))
     except DineError as error:
         with contextlib.suppress(OSError):  # the parent is dead
             writer.send(error)

@@ -15,7 +15,8 @@ from dine.errors import CheckpointError, ConfigError
 from dine.files import digest, file_digest, write_json, write_text
 from dine.models.backbones import BACKBONES, Backbone
 from dine.models.checkpoint import load_backbone, save_backbone
-from dine.models.inference import COMPUTE, chosen_device
+from dine.models.devices import chosen_device
+from dine.models.inference import COMPUTE
 from dine.provenance import code_digest, run_record
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import history_csv, train

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import pickle
-import platform
 import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import filelock
 import torch
 
 from dine.errors import DineError
-from dine.files import atomic_path, read_json, storage_errors, write_json
+from dine.files import atomic_path, held, read_json, storage_errors, write_json
 
 
 class Interrupted(DineError):
@@ -30,35 +27,22 @@ ASKED = "asked.json"
 def one_writer(folder: Path, identity: dict[str, str]) -> Iterator[None]:
     """Hold a run folder; a second process that wants it is refused.
 
-    The operating system lets go of the lock when the holder dies, however it dies. One that was
-    refused leaves its ``identity`` behind, for :func:`check_still_wanted`.
+    One that was refused leaves its ``identity`` behind, for :func:`check_still_wanted`.
 
     Raises:
         DineError: another process is training in the folder.
         StorageError: the folder cannot be written.
     """
-    with storage_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    holder = folder / "holder.txt"
-    lock = filelock.FileLock(folder / "lock", timeout=0)
-    try:
-        with storage_errors(folder):
-            lock.acquire()
-    except filelock.Timeout:
-        write_json(folder / ASKED, identity)
-        who = holder.read_text().strip() if holder.exists() else ""
-        raise DineError(
-            f"{folder} is in use by {who or 'another process'}; wait for it or stop it, then run "
-            "the same command again."
-        ) from None
-    try:
+    with held(folder / "lock") as who:
+        if who:
+            write_json(folder / ASKED, identity)
+            raise DineError(
+                f"{folder} is in use by {who}; wait for it or stop it, then run the same command "
+                "again."
+            )
         with storage_errors(folder):
             (folder / ASKED).unlink(missing_ok=True)
-            holder.write_text(f"process {os.getpid()} on {platform.node()}\n")
         yield
-    finally:
-        holder.unlink(missing_ok=True)
-        lock.release()
 
 
 def check_still_wanted(folder: Path, identity: dict[str, str], name: str) -> None:

@@ -159,6 +159,30 @@ CHANGES = {
 }
 
 
+ENORMOUS = {"resources": {"reporting": {"memory_mb": 10**9, "minutes": 10**6}}}
+
+
+def test_requests_reach_the_jobs_and_stop_nothing_here(tmp_path):
+    folder = copy_workflow(tmp_path)
+    target = Path(RESULTS) / "config.yaml"
+    arguments = (target, *changed(folder, ENORMOUS)[1:])
+    assert f"mem_mb={10**9}" in snakemake(folder, "-n", *arguments).stdout
+    snakemake(folder, *arguments)
+    assert (folder / target).is_file()
+
+
+def test_every_job_has_its_requests():
+    for path in (ROOT / "workflow" / "rules").glob("*.smk"):
+        text = path.read_text()
+        assert text.count("    shell:") == text.count("**request("), path.name
+
+
+def test_requests_make_nothing_again_but_the_record_of_them(finished):
+    requests = {kind: {"minutes": 5} for kind in ("data", "training", "prior", "reporting")}
+    jobs = planned(finished, *changed(finished, {"resources": requests}))
+    assert jobs == {"resolved_config": 1, "html": 1, "all": 1}
+
+
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_change_reruns_what_depends_on_it(finished, change):
     settings, expected = CHANGES[change]

@@ -16,8 +16,8 @@ from dine.results import (
     NO_BACKBONE,
     backbone_and_seed,
     conditions,
-    evidence_cells,
     evidence_conditions,
+    evidence_groups,
     evidence_names,
     figure_names,
     pca_priors,
@@ -36,6 +36,8 @@ FILES = Results(RESULTS)
 FIGURES = figure_names(CONFIG)
 TABLES = table_names(CONFIG)
 RUNS = runs(CONFIG)
+# Once: to look through all of them for each job would take minutes for thousands of jobs.
+GROUPS = evidence_groups(CONFIG)
 
 # Rules call the `dine` that belongs to the Python that runs Snakemake.
 shell.prefix(
@@ -50,6 +52,8 @@ THREADS = CONFIG.threads
 # A training is one job, whatever the number of its processes. Their number changes results by
 # rounding only, so it is a resource and no parameter: nothing finished is made again for it.
 PROCESSES = CONFIG.processes
+# Kinds of jobs that compute on CONFIG.device, and in how many processes.
+ON_DEVICE = {"training": PROCESSES, "prediction": 1}
 COMPUTE = f"--device {CONFIG.device} --precision {CONFIG.precision}"
 
 # Where rule logs, benchmarks and the run folder of a method lie.
@@ -86,6 +90,24 @@ def drawn_settings():
     return json.dumps(
         CONFIG.model_dump(mode="json", exclude_none=True, include=drawn), sort_keys=True
     )
+
+
+def whole_config():
+    """All of the configuration that can change a result, as text."""
+    everywhere = {"resources": dine_config.Resources()}
+    return section(CONFIG.model_copy(update=everywhere))
+
+
+def request(kind):
+    """Resources of a kind of job. Locally only `gpu` is counted; a cluster is asked for all."""
+    asked = getattr(CONFIG.resources, kind)
+    processes = ON_DEVICE.get(kind, 1)
+    found = {"mem_mb": asked.memory_mb * processes, "runtime": asked.minutes}
+    if kind in ON_DEVICE:
+        found["processes"] = processes
+        if GPUS:  # some executors ask for a GPU wherever the word stands, be it with 0
+            found["gpu"] = GPUS * processes
+    return found
 
 
 def options(flag, *columns):
@@ -354,8 +376,7 @@ def refined_prior_options(wildcards, input):
 
 
 def group_cells(wildcards):
-    group = (wildcards.dataset, wildcards.group, int(wildcards.seed))
-    return [cell for cell in evidence_cells(CONFIG) if cell[:3] == group]
+    return GROUPS[wildcards.dataset, wildcards.group, int(wildcards.seed)]
 
 
 def cell_predictions(cells):
@@ -379,17 +400,17 @@ def cell_options(cells, predictions):
 def example_cells(wildcards):
     """What is drawn of a dataset: with the backbone of the search and the first seed."""
     place = (CONFIG.lambda_search.backbone, CONFIG.evidence.seeds[0])
-    found = {
-        cell.method: cell
-        for cell in evidence_cells(CONFIG)
-        if cell.dataset == wildcards.dataset
-        and (cell.backbone, cell.seed) in {place, (NO_BACKBONE, 0)}
-    }
+    some = [
+        cell
+        for backbone, seed in (place, (NO_BACKBONE, 0))
+        for cell in GROUPS.get((wildcards.dataset, backbone, seed), ())
+    ]
+    found = {cell.method: cell for cell in some}
     return [found[name] for name in CONFIG.evidence.examples if name in found]
 
 
 def evidence_examples():
-    datasets = dict.fromkeys(cell.dataset for cell in evidence_cells(CONFIG))
+    datasets = dict.fromkeys(dataset for dataset, _, _ in GROUPS)
     return [FILES.evidence(dataset, "examples.png") for dataset in datasets]
 
 
@@ -402,10 +423,9 @@ def evidence_example_options(wildcards, input):
 
 
 def evidence_metrics():
-    groups = dict.fromkeys(cell[:3] for cell in evidence_cells(CONFIG))
     return [
         FILES.evidence(dataset, backbone, f"seed{seed}", "metrics.csv")
-        for dataset, backbone, seed in groups
+        for dataset, backbone, seed in GROUPS
     ]
 
 

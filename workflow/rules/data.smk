@@ -12,6 +12,8 @@ rule raw:
         BENCHMARKS / "{dataset}" / "raw.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=raw_settings,
         signature=raw_signature,
@@ -33,6 +35,8 @@ rule pairs:
         BENCHMARKS / "{dataset}" / "pairs.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=lambda wildcards: section(CONFIG.datasets[wildcards.dataset].pairs),
         seed=CONFIG.seed,
@@ -53,6 +57,8 @@ rule agreement:
         BENCHMARKS / "{dataset}" / "agreement.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         seed=CONFIG.seed,
         code=code_digest("agreement"),
@@ -71,6 +77,8 @@ rule corrupt:
         BENCHMARKS / "{dataset}" / "variants" / "{condition}_{corruption}.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         seed=CONFIG.seed,
         code=code_digest("corrupt"),

@@ -16,7 +16,7 @@ rule predict:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
@@ -43,6 +43,8 @@ rule evaluate:
         BENCHMARKS / "{dataset}" / "{backbone}" / "{run}" / "evaluate.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("evaluation"),
     params:
         variants=variant_options,
         method=lambda wildcards: wildcards.run.removeprefix("stage2/"),

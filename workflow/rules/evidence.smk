@@ -31,6 +31,8 @@ rule evidence_raw:
         EVIDENCE_LOGS / "{dataset}" / "raw.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=evidence_raw_settings,
         signature=evidence_raw_signature,
@@ -51,6 +53,8 @@ rule evidence_pairs:
         EVIDENCE_LOGS / "{dataset}" / "pairs.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=evidence_pair_settings,
         seed=CONFIG.seed,
@@ -71,6 +75,8 @@ rule evidence_corrupt:
         condition="noise|outliers",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         levels=evidence_levels,
         seed=CONFIG.seed,
@@ -90,6 +96,8 @@ rule evidence_resample:
         EVIDENCE_LOGS / "{dataset}" / "variants" / "resampled_1.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         levels=evidence_levels,
         seed=CONFIG.seed,
@@ -116,8 +124,7 @@ rule evidence_lambda:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         stage2=method_stage2,
         settings=evidence_search,
@@ -146,8 +153,7 @@ rule stage2_method:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         prior=method_prior_options,
         settings=method_stage2,
@@ -185,7 +191,7 @@ rule evidence_predict:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         variants=variant_options,
         batch=CONFIG.evaluation.batch_size,
@@ -219,6 +225,8 @@ rule evidence_refine:
     conda:
         "../envs/dine.yaml"
     threads: THREADS
+    resources:
+        **request("registration"),
     params:
         variants=variant_options,
         prior=refined_prior_options,
@@ -242,6 +250,8 @@ rule evidence_classical:
     conda:
         "../envs/dine.yaml"
     threads: THREADS
+    resources:
+        **request("registration"),
     params:
         variants=variant_options,
         algorithm=lambda wildcards: CONFIG.evidence.methods[
@@ -273,6 +283,8 @@ rule evidence_evaluate:
         group=f"none|{EVERY_BACKBONE}",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("evaluation"),
     params:
         variants=variant_options,
         runs=lambda wildcards, input: cell_options(
@@ -298,6 +310,8 @@ rule evidence_diagnose:
         EVIDENCE_LOGS / "diagnostics" / "{dataset}" / "{backbone}" / "{prior}.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("prior"),
     params:
         seed=CONFIG.seed,
         code=lambda wildcards: code_of("diagnose", priors=[wildcards.prior]),
@@ -319,6 +333,8 @@ rule evidence_examples:
         EVIDENCE_LOGS / "{dataset}" / "examples.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("reporting"),
     params:
         variants=variant_options,
         runs=lambda wildcards, input: cell_options(
@@ -347,12 +363,14 @@ rule evidence:
         EVIDENCE_LOGS / "report.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("reporting"),
     params:
         searches=lambda wildcards, input: options("--search", input.searches),
         diagnostics=lambda wildcards, input: options("--diagnostics", input.diagnostics),
         examples=evidence_example_options,
         methods=evidence_method_texts(),
-        settings=section(CONFIG),
+        settings=whole_config(),
         code=code_digest("evidence"),
     shell:
         "dine --log {log:q} evidence {input.metrics:q} {params.searches} {params.diagnostics}"

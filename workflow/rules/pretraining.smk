@@ -18,6 +18,8 @@ rule pretraining_raw:
         LOGS / "pretraining" / "{shape}_raw.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=lambda wildcards: json.dumps(
             {
@@ -47,6 +49,8 @@ rule pretraining_pairs:
         LOGS / "pretraining" / "{shape}_pairs.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         settings=lambda wildcards: json.dumps(
             {
@@ -73,6 +77,8 @@ rule pretraining_targets:
         LOGS / "pretraining" / "{shape}_targets.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         seed=CONFIG.seed,
         code=code_digest("resample"),
@@ -97,8 +103,7 @@ rule pretrain:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         pairs=lambda wildcards, input: options("--pairs", input.pairs),
         targets=lambda wildcards, input: options("--targets", input.targets),
@@ -132,7 +137,7 @@ rule pretraining_fields:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         compute=COMPUTE,
         code=lambda wildcards: code_of("fields", wildcards.backbone),
@@ -156,6 +161,8 @@ rule pretraining_prior:
     conda:
         "../envs/dine.yaml"
     threads: THREADS
+    resources:
+        **request("prior"),
     params:
         fields=lambda wildcards, input: options("--fields", input),
         settings=json.dumps({"kind": "pca"}),
@@ -181,7 +188,7 @@ rule pretraining_calibration:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         pairs=lambda wildcards, input: options("--pairs", input.pairs),
         targets=lambda wildcards, input: options("--targets", input.targets),

@@ -14,6 +14,8 @@ rule fit_prior:
     conda:
         "../envs/dine.yaml"
     threads: THREADS
+    resources:
+        **request("prior"),
     params:
         settings=prior_settings,
         seed=training_seed,
@@ -45,8 +47,7 @@ rule search_lambda:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         priors=lambda wildcards, input: options("--prior", SEARCH.priors, input.priors),
         stage2=section(CONFIG.stage2),

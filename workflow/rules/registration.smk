@@ -12,6 +12,8 @@ rule calibration_targets:
         LOGS / "{dataset}" / "resampled.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("data"),
     params:
         seed=CONFIG.seed,
         code=code_digest("resample"),
@@ -35,7 +37,7 @@ rule calibrate:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         prior=lambda wildcards, input: options("--prior", input.prior),
         device=CONFIG.device,

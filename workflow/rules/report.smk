@@ -28,6 +28,8 @@ rule tables:
         BENCHMARKS / "tables.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("reporting"),
     params:
         code=code_digest("tables"),
     shell:
@@ -61,6 +63,8 @@ rule figures:
         BENCHMARKS / "figures.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("reporting"),
     params:
         results=RESULTS,
         settings=drawn_settings(),
@@ -77,6 +81,8 @@ rule resolved_config:
         LOGS / "config.log",
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("reporting"),
     params:
         config=section(CONFIG),
     shell:
@@ -106,9 +112,11 @@ rule html:
         BENCHMARKS / "html.tsv"
     conda:
         "../envs/dine.yaml"
+    resources:
+        **request("reporting"),
     params:
         results=RESULTS,
-        settings=section(CONFIG),
+        settings=whole_config(),
         code=code_digest("report"),
     shell:
         "dine --log {log:q} report --results {params.results:q} --settings {params.settings:q}"
@@ -137,6 +145,8 @@ for PRIOR in CONFIG.priors:
             BENCHMARKS / "ablation" / f"{PRIOR}.tsv"
         conda:
             "../envs/dine.yaml"
+        resources:
+            **request("reporting"),
         params:
             code=code_digest("tables"),
         shell:

@@ -17,8 +17,7 @@ rule stage1:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         backbone=backbone_settings,
         settings=stage1_settings,
@@ -50,7 +49,7 @@ rule fields:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
-        gpu=GPUS,
+        **request("prediction"),
     params:
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,

@@ -15,8 +15,7 @@ rule stage2_control:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         settings=section(CONFIG.stage2),
         seed=training_seed,
@@ -52,8 +51,7 @@ rule stage2_prior:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
-        gpu=GPUS * PROCESSES,
-        processes=PROCESSES,
+        **request("training"),
     params:
         settings=section(CONFIG.stage2),
         seed=training_seed,
