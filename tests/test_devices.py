@@ -1,6 +1,7 @@
 """Devices are held by one process at a time, without a GPU: their names are injected."""
 
 import os
+import platform
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -115,7 +116,7 @@ def test_a_process_does_not_wait_for_itself(two, no_waiting):
         with devices.leased(CUDA) as inner:
             assert inner == outer
         with devices.held(devices._folder() / "GPU-0") as who:
-            assert who == f"process {os.getpid()}"
+            assert who == f"process {os.getpid()} on {platform.node()}"
     with devices.held(devices._folder() / "GPU-0") as who:
         assert who is None
 
