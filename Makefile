@@ -3,9 +3,11 @@
 
 PYTHON ?= python3
 JOBS ?= 2
+INPUTS ?= 12000
+SEED ?= 0
 BIN := .venv/bin
 
-.PHONY: run tiny test kill-test check format docs wheel-check slurm-test
+.PHONY: run tiny test kill-test fuzz test-oldest check format docs wheel-check slurm-test audit lock
 
 run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
@@ -48,9 +50,35 @@ wheel-check:
 slurm-test: .venv/installed
 	.ci/slurm
 
-.venv/installed: requirements.lock pyproject.toml
+# Many damaged files for every reader; failing ones are kept in fuzz-failures/. For a nightly run.
+fuzz: .venv/installed
+	cd tests && ../$(BIN)/python -m fuzz --inputs $(INPUTS) --seed $(SEED) --out ../fuzz-failures
+
+# The lowest versions that pyproject.toml allows; TORCH=2.13.0 for another PyTorch than the lowest.
+test-oldest: .tools/installed
+	PYTHON=$(PYTHON) TORCH=$(TORCH) .ci/oldest
+
+# Known vulnerabilities of the locked versions; needs the network.
+audit: .tools/installed
+	.tools/bin/pip-audit --strict --require-hashes --disable-pip --requirement requirements.lock
+	.tools/bin/pip-audit --strict --no-deps --disable-pip --requirement requirements-torch.lock
+
+# The locks anew from pyproject.toml; UPGRADE="--upgrade" for the newest versions of everything.
+lock: .tools/installed
+	.ci/lock $(UPGRADE)
+
+# Everything comes with a hash, but for PyTorch, whose CPU and CUDA builds share a version; what it
+# needs beyond the lock are the CUDA libraries of its build, in the versions that it names.
+.venv/installed: requirements.lock requirements-torch.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --requirement requirements.lock
-	$(BIN)/pip install --quiet --no-deps --editable .
+	$(BIN)/pip install --quiet --require-hashes --no-deps --requirement requirements.lock
+	$(BIN)/pip install --quiet --requirement requirements-torch.lock
+	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/pip check
+	touch $@
+
+.tools/installed: requirements-tools.lock
+	$(PYTHON) -m venv .tools
+	.tools/bin/pip install --quiet --require-hashes --no-deps --requirement requirements-tools.lock
 	touch $@

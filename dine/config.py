@@ -6,6 +6,7 @@ Importing this module is cheap (no torch), since Snakemake does it for every DAG
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +22,10 @@ STAGE1 = "stage1"
 
 NAMED = ("datasets", "backbones", "priors")
 """Sections whose keys are names of the user's choice."""
+
+_NOT_YAML = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
+_MOST_FAULTS = 30
+_MOST_VALUES, _DEEPEST = 100_000, 50
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
 
@@ -635,17 +640,23 @@ def explain(error: ValidationError, where: str = "") -> str:
     lines = []
     for fault in error.errors():
         key = ".".join([where, *map(str, fault["loc"])] if where else map(str, fault["loc"]))
-        value = fault["input"]
+        value = _short(fault["input"])
         if fault["type"] == "extra_forbidden":
-            lines.append(f"`{key}` is not a known key (value {value!r}); check the spelling")
+            lines.append(f"`{key}` is not a known key (value {value}); check the spelling")
         elif fault["type"] == "missing":
             lines.append(f"`{key}` is missing")
         elif fault["type"] == "value_error":
             text = str(fault["ctx"]["error"])
             lines.append(f"`{key}`: {text}" if key else text)
         else:
-            lines.append(f"`{key}` is {value!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
-    return "; ".join(lines)
+            lines.append(f"`{key}` is {value}: {fault['msg'][0].lower()}{fault['msg'][1:]}")
+    more = f"; and {len(lines) - _MOST_FAULTS} more" if len(lines) > _MOST_FAULTS else ""
+    return " ".join(f"{'; '.join(lines[:_MOST_FAULTS])}{more}".split())
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 200 else f"{text[:200]}…"
 
 
 def validate(values: Any, where: str = "the configuration") -> Config:
@@ -701,11 +712,11 @@ def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
         for name, entry in entries.items():
             if isinstance(entry, dict):
                 entry = dict(entry)
-                if entry.get("prior") in gone.get("priors", ()):
+                if _is_gone(entry.get("prior"), gone.get("priors", ())):
                     continue
                 lists = [key for key in NAMED if isinstance(entry.get(key), list)]
                 for key in lists:
-                    entry[key] = [x for x in entry[key] if x not in gone.get(key, ())]
+                    entry[key] = [x for x in entry[key] if not _is_gone(x, gone.get(key, ()))]
                 # Priors are what a backbone is tried with; without datasets nothing is left.
                 if any(not entry[key] for key in lists if key != "priors"):
                     continue
@@ -716,6 +727,10 @@ def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
     if isinstance(evidence.get("examples"), list):
         lost = gone.get("methods", set()) | gone.get("priors", set())
         evidence["examples"] = [name for name in evidence["examples"] if name not in lost]
+
+
+def _is_gone(name: Any, gone: Collection[str]) -> bool:
+    return isinstance(name, str) and name in gone
 
 
 def validate_section(model: type[Section], values: Any, where: str):
@@ -738,11 +753,31 @@ def read_yaml(path: str | Path) -> dict[str, Any]:
         values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from None
+    # Values that look like a date or a number and are none raise what their constructors do.
+    except (yaml.YAMLError, *_NOT_YAML) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"{path} is not valid YAML: {reason[:300]}") from None
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: expected keys and values, found {type(values).__name__}.")
+    _check_extent(values, path)
     return values
+
+
+def _check_extent(values: dict[str, Any], path: str | Path) -> None:
+    """Refuse what anchors make endless or huge."""
+    waiting: list[tuple[Any, int]] = [(values, 0)]
+    seen = 0
+    while waiting:
+        value, depth = waiting.pop()
+        seen += 1
+        if seen > _MOST_VALUES or depth > _DEEPEST:
+            raise ConfigError(
+                f"{path} holds more than {_MOST_VALUES} values or is nested more than {_DEEPEST} "
+                "deep, its anchors followed; write them out."
+            )
+        if isinstance(value, dict | list):
+            inner = value.values() if isinstance(value, dict) else value
+            waiting += [(item, depth + 1) for item in inner]
 
 
 def merge(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from dine.errors import ConfigError
 
@@ -32,6 +33,26 @@ class Registry(Generic[T]):
         """The built-in names, sorted."""
         return sorted(self._classes)
 
+    def named_in_file(self, name: Any, base: type[T]) -> type[T]:
+        """The class that a file says it was made with: a built-in one, or an extension's.
+
+        A file comes from anywhere, so it may not choose what is run: nothing of Python's own
+        library is imported, and what is found must be a class of DINE's kind.
+
+        Raises:
+            ConfigError: neither, or not importable.
+        """
+        if not isinstance(name, str):
+            raise ConfigError(f"The name of the {self.what} is {name!r}; expected text.")
+        if name not in self._classes and name.split(".")[0].split(":")[0] in (
+            sys.stdlib_module_names
+        ):
+            raise ConfigError(f"{name!r} is no {self.what}.")
+        cls = self.get(name)
+        if not (isinstance(cls, type) and issubclass(cls, base)):
+            raise ConfigError(f"{name!r} is no {self.what}.")
+        return cls
+
     def get(self, name: str) -> type[T]:
         """The class called ``name``.
 
@@ -44,7 +65,7 @@ class Registry(Generic[T]):
             module, _, attribute = name.partition(":")
             try:
                 cls = getattr(importlib.import_module(module), attribute)
-            except (ImportError, AttributeError) as error:
+            except (ImportError, AttributeError, TypeError, ValueError) as error:
                 raise ConfigError(
                     f"The {self.what} {name!r} could not be imported ({error}); expected "
                     "'package.module:Class' on the Python path."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -21,6 +22,7 @@ from typing import IO, Any
 
 import requests
 
+from dine.data import announced
 from dine.errors import DownloadError, StorageError
 from dine.files import file_digest, read_json, write_json
 
@@ -30,6 +32,9 @@ _BY_HAND = (
     "check the network and run the same command again to resume, or download the dataset by hand "
     "and use `source: {kind: path, folder: ...}`"
 )
+_LARGEST_LIST = 1 << 28
+# What an answer raises that is JSON, but not of the expected form.
+_MALFORMED = (KeyError, TypeError, AttributeError, ValueError, OverflowError, RecursionError)
 _MANIFEST = "manifest.json"
 _UNPACKED = ".unpacked.json"
 
@@ -166,12 +171,12 @@ class _Client:
 
         def ask() -> Any:
             with self._get(address, params={"persistentId": f"doi:{self.doi}"}) as answer:
-                return answer.json()
+                return json.loads(self._small(answer))
 
         try:
             answer = self._persist(ask, what)
             files = [self._file(entry) for entry in answer["data"]["files"]]
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
+        except _MALFORMED as error:
             raise self.error(
                 f"{what} is not what a Dataverse sends ({type(error).__name__}: {error}); check "
                 "the server's address"
@@ -192,16 +197,25 @@ class _Client:
             checksum = {"type": checksum["type"].upper(), "value": checksum["value"].lower()}
             if checksum["type"] not in _HASHES:
                 raise self.error(f"{path} has a checksum of the unknown kind {checksum['type']}")
-        variants = [_Variant(path, data.get("filesize"), original=False)]
+        variants = [_Variant(path, _size(data.get("filesize")), original=False)]
         # Tables are converted on upload; the checksum may still be that of the original.
         is_converted = any(key.startswith("originalFile") for key in data)
         if is_converted or data.get("contentType") == "text/tab-separated-values":
             name = self._safe_path(folder, data.get("originalFileName") or label)
-            original = _Variant(name, data.get("originalFileSize"), original=True)
+            original = _Variant(name, _size(data.get("originalFileSize")), original=True)
             variants.insert(0 if is_converted else 1, original)
         return _File(
             int(data["id"]), path, bool(entry.get("restricted")), checksum or None, tuple(variants)
         )
+
+    def _small(self, answer: requests.Response) -> bytes:
+        """The content of an answer that has no reason to be large."""
+        content = bytearray()
+        for piece in answer.iter_content(self.chunk):
+            content += piece
+            if len(content) > _LARGEST_LIST:
+                raise self.error(f"its list of files is larger than {_LARGEST_LIST} bytes")
+        return bytes(content)
 
     def _safe_path(self, folder: str, label: str) -> PurePosixPath:
         try:
@@ -291,6 +305,8 @@ class _Client:
                 for piece in answer.iter_content(self.chunk):
                     stream.write(piece)
                     done += len(piece)
+                    if variant.size is not None and done > variant.size:
+                        break  # which is noticed; nobody knows when it would end
                     if self.progress is not None:
                         self.progress(str(variant.path), done, variant.size)
         return start
@@ -352,6 +368,17 @@ def _safe_path(text: str) -> PurePosixPath:
     return path
 
 
+def _size(value: Any) -> int | None:
+    """A size in bytes as the server says it; None where it does not.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    if value is None or (type(value) is int and value >= 0):
+        return value
+    raise ValueError(f"{value!r} is no size in bytes")
+
+
 def _part_of(path: PurePosixPath) -> PurePosixPath:
     return path.with_name(path.name + ".part")
 
@@ -411,6 +438,22 @@ _DAMAGE = (
     ValueError,
 )
 
+
+class _Limited(gzip.GzipFile):
+    """Refuses to go on when more comes out than compressed data can hold."""
+
+    def __init__(self, stream: IO[bytes], most: int):
+        super().__init__(fileobj=stream, mode="rb")
+        self._most = most
+
+    def read(self, size: int | None = -1) -> bytes:
+        left = max(0, self._most - self.tell())
+        content = super().read(left + 1 if size is None or size < 0 else min(size, left + 1))
+        if len(content) > left:
+            raise ValueError(f"it holds more than {self._most} bytes, which is not plausible")
+        return content
+
+
 # Name, size (None for a folder), and how to open it.
 _Member = tuple[str, int | None, Callable[[], IO[bytes]]]
 
@@ -453,7 +496,7 @@ def _unpack(archive: Path, target: Path, checksum: dict[str, str] | None) -> Non
         fresh.mkdir()
         try:
             with _open_archive(archive) as members:
-                _extract(members, fresh)
+                _extract(members, fresh, archive.stat().st_size)
         except _DAMAGE as error:
             raise DownloadError(
                 f"{archive} cannot be unpacked: {error or type(error).__name__}; nothing of it was "
@@ -473,7 +516,11 @@ def _open_archive(path: Path) -> Iterator[list[_Member]]:
             yield [_zip_member(archive, info) for info in archive.infolist()]
     else:
         mode = "r:" if path.suffix.lower() == ".tar" else "r:gz"
-        with tarfile.open(path, mode) as archive:
+        with (
+            open(path, "rb") as packed,
+            _Limited(packed, announced.limit(path.stat().st_size)) as stream,
+            tarfile.open(fileobj=packed if mode == "r:" else stream, mode="r:") as archive,
+        ):
             yield [_tar_member(archive, info) for info in archive.getmembers()]
 
 
@@ -491,7 +538,7 @@ def _tar_member(archive: tarfile.TarFile, info: tarfile.TarInfo) -> _Member:
     return info.name, None if info.isdir() else info.size, lambda: archive.extractfile(info)
 
 
-def _extract(members: list[_Member], folder: Path) -> None:
+def _extract(members: list[_Member], folder: Path, packed: int) -> None:
     """Write the members, after all of their names and sizes are checked."""
     paths = {}
     for name, size, open_member in members:
@@ -505,6 +552,9 @@ def _extract(members: list[_Member], folder: Path) -> None:
             raise ValueError(f"its member {name!r} would overwrite another file")
         paths[path] = (size, open_member)
     needed = sum(size or 0 for size, _ in paths.values())
+    allowed = announced.limit(packed)
+    if needed > allowed:
+        raise ValueError(f"it announces {needed} bytes, and only {allowed} are plausible")
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise ValueError(f"it announces {needed} bytes, and only {free} are free on the disk")

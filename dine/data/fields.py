@@ -10,11 +10,15 @@ from dataclasses import dataclass
 import h5py
 import numpy as np
 
+from dine.data import announced
 from dine.errors import DataError
 from dine.files import atomic_path
 
 FIELDS_FORMAT = "dine-fields"
 """Fields of one model on the training split, at the top level of the file."""
+
+
+_TRAINING = ("displacement", "source", "true")
 
 
 @contextmanager
@@ -26,13 +30,14 @@ def opened(path: str | os.PathLike, expected: str) -> Iterator[h5py.File]:
     """
     try:
         with h5py.File(path) as file:
-            if file.attrs.get("format") != expected:
+            if str(file.attrs.get("format")) != expected:
                 raise DataError(f"{path} is of another kind than {expected}.")
             yield file
     except FileNotFoundError:
         raise DataError(f"{path} does not exist; run the step that makes it first.") from None
-    except (OSError, KeyError) as error:
-        raise DataError(f"{path} is damaged ({error}); delete it and run again.") from error
+    except announced.DAMAGE as error:
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path} is damaged ({reason}); delete it and run again.") from error
 
 
 @dataclass(frozen=True)
@@ -66,9 +71,50 @@ def put_names(group: h5py.Group, pair: np.ndarray) -> None:
     group.create_dataset("pair", data=pair.astype(object), dtype=h5py.string_dtype())
 
 
-def get_names(group: h5py.Group) -> np.ndarray:
-    """The (P,) pair names of a group."""
-    return group["pair"].asstr()[:].astype(str)
+def get_names(group: h5py.Group, count: int) -> np.ndarray:
+    """The (P,) pair names of a group.
+
+    Raises:
+        ValueError: there are more or fewer than ``count``.
+    """
+    data = announced.checked(group, "pair")
+    if data.shape != (count,):
+        raise ValueError(f"{count} names of pairs are needed, and there is {data.shape}")
+    return data.asstr()[:].astype(str)
+
+
+def get_text(item: h5py.HLObject, name: str) -> str:
+    """A text attribute.
+
+    Raises:
+        KeyError: it is missing.
+        ValueError: it is something else.
+    """
+    value = item.attrs[name]
+    if not isinstance(value, str):
+        raise ValueError(f"its attribute {name!r} is no text")
+    return value
+
+
+def get_numbers(
+    group: h5py.Group, name: str, shape: tuple[int | None, ...], dtype: str = "f4"
+) -> np.ndarray:
+    """A finite array of floats, such as fields (P, N, 3); None fits any number of rows.
+
+    Raises:
+        DataError: missing, or larger than the file.
+        ValueError: of another type or shape, or with NaN or infinite values.
+    """
+    data = announced.checked(group, name)
+    fits = len(data.shape) == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, data.shape, strict=True)
+    )
+    if data.dtype != dtype or not fits:
+        raise ValueError(f"the array {name!r} has type {data.dtype} and shape {data.shape}")
+    values = data[()]
+    if not np.isfinite(values).all():
+        raise ValueError(f"the array {name!r} holds NaN or infinite values")
+    return values
 
 
 def write_training_fields(
@@ -78,7 +124,7 @@ def write_training_fields(
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(format=FIELDS_FORMAT, convention=fields.convention, **facts)
         put_fields(file, pair, fields.displacement)
-        for name, what in (("source", "source points"), ("true", "true displacements")):
+        for name, what in zip(_TRAINING[1:], ("source points", "true displacements"), strict=True):
             values = getattr(fields, name)
             data = file.create_dataset(
                 name, data=values, chunks=(1, *values.shape[1:]), fletcher32=True
@@ -93,5 +139,7 @@ def read_fields(path: str | os.PathLike) -> TrainingFields:
         DataError: missing, damaged, or another kind of file.
     """
     with opened(path, FIELDS_FORMAT) as file:
-        values = (file[name][:] for name in ("displacement", "source", "true"))
-        return TrainingFields(*values, convention=str(file.attrs["convention"]))
+        values = [get_numbers(file, name, (None, None, 3)) for name in _TRAINING]
+        if len({array.shape for array in values}) > 1:
+            raise ValueError("its fields and sources are of different shapes")
+        return TrainingFields(*values, convention=get_text(file, "convention"))

@@ -131,7 +131,7 @@ def scan(folder: str | os.PathLike) -> Inventory:
     folder = Path(folder)
     if folder.suffix.lower() == ".csv" and folder.is_file():
         return _listed(folder)
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # also where the name cannot be that of a folder
         raise DataError(
             f"{folder} is not a folder; expected a dataset with Source_ and Target_ files, or a "
             "folder of meshes."
@@ -677,7 +677,10 @@ def _json_items(path: Path) -> list[tuple[Any, Any]]:
 
 
 def _csv_items(path: Path, text: str) -> list[tuple[Any, Any]]:
-    rows = list(csv.DictReader(text.splitlines(), skipinitialspace=True))
+    try:
+        rows = list(csv.DictReader(text.splitlines(), skipinitialspace=True))
+    except csv.Error as error:
+        raise _bad_split(path, f"it is no CSV file ({error})") from error
     columns = {name.strip().lower(): name for name in (rows[0] if rows else {}) if name}
     names = next((columns[name] for name in ("name", "object") if name in columns), None)
     if names is None or "split" not in columns:

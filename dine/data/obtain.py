@@ -110,4 +110,8 @@ def report(inventory: Inventory, folder: Path) -> None:
 def obtained(raw: Path) -> tuple[Inventory, str]:
     """The files behind a ``raw.json`` and their origin."""
     facts = read_json(raw)
-    return scan(facts["folder"]), facts["origin"]
+    found = [facts.get(key) for key in ("folder", "origin")] if isinstance(facts, dict) else [None]
+    if not all(isinstance(value, str) and "\0" not in value for value in found):
+        raise DataError(f"{raw} does not say where the files are; run the step `raw` again.")
+    folder, origin = found
+    return scan(folder), origin

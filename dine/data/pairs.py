@@ -50,6 +50,7 @@ import numpy as np
 import scipy
 
 from dine import __version__
+from dine.data import announced
 from dine.data.sampling import SurfaceSamples
 from dine.errors import ConfigError, DataError
 from dine.files import atomic_path, digest
@@ -507,11 +508,7 @@ def _opened(
             if missing:
                 raise ValueError(f"it lacks the dataset {missing[0]}")
             yield file, attributes
-    # What HDF5, or decoding what it read, raises depends on where the damage is.
-    except (
-        *(OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeError),
-        *(MemoryError, OverflowError, DataError),
-    ) as error:
+    except (*announced.DAMAGE, DataError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise DataError(
             f"{path} is damaged or not a {form} file ({reason}); delete it and run the same "
@@ -525,7 +522,7 @@ def _read_columns(
     """Columns as stored, whole or at increasing rows."""
     columns = {}
     for name, (kind, *_) in schema.items():
-        data = file[name]
+        data = announced.checked(file, name)
         stored = data.dtype
         if stored.kind != "S" if kind == _TEXT else stored != np.dtype(kind):
             raise ValueError(f"the dataset {name} has type {stored}")

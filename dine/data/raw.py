@@ -275,7 +275,7 @@ def _is_made(folder: Path, key: dict[str, Any]) -> bool:
         return False
     provenance = folder / "provenance.json"
     stored = read_json(provenance) if provenance.is_file() else {}
-    if stored.get("made_by") != _MAKER:
+    if not isinstance(stored, dict) or stored.get("made_by") != _MAKER:
         raise DataError(
             f"{folder} exists and holds something that was not made here; choose another folder, "
             "or move it away."

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import os
 import re
 import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import h5py
@@ -20,6 +21,7 @@ import numpy as np
 import scipy.io
 import trimesh
 
+from dine.data import announced
 from dine.data.surface import Surface
 from dine.data.vtk import read_vtk, read_vtp
 from dine.errors import DataError
@@ -128,17 +130,19 @@ def _read_mesh(path: Path) -> _Arrays:
         raise DataError(
             f"{path} is cut short: it holds less than its header announces; copy it again."
         )
+    if suffix in (".gltf", ".glb"):
+        _check_gltf(path, data)
     loaded = trimesh.load(
         io.BytesIO(data),
         file_type=suffix[1:],
-        resolver=trimesh.resolvers.FilePathResolver(str(path)),
+        resolver=_Beside(path),
         process=False,
         maintain_order=True,
         skip_materials=True,
         fix_texture=False,  # would split vertices along texture seams
     )
     vertices, faces, count = [], [], 0
-    for part in _parts(loaded):
+    for part in _parts(path, loaded):
         vertices.append(np.asarray(part.vertices, dtype=np.float64))
         if len(getattr(part, "faces", ())):
             faces.append(np.asarray(part.faces, dtype=np.int64) + count)
@@ -148,7 +152,45 @@ def _read_mesh(path: Path) -> _Arrays:
     return np.concatenate(vertices), np.concatenate(faces) if faces else None
 
 
-def _parts(loaded: trimesh.parent.Geometry) -> list[trimesh.parent.Geometry]:
+class _Beside(trimesh.resolvers.Resolver):
+    """Files that a mesh file names, such as the buffers of a glTF, from its own folder only."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def get(self, name: str) -> bytes:
+        folder = self.path.parent.resolve()
+        found = (folder / name).resolve()
+        if not found.is_relative_to(folder) or not found.is_file():
+            raise DataError(
+                f"{self.path} names the file {name!r}, which is not in its folder; export the mesh "
+                "as a single file."
+            )
+        return found.read_bytes()
+
+    def write(self, name: str, data: str | bytes) -> None:
+        raise NotImplementedError("reading writes nothing")
+
+    def keys(self) -> list[str]:
+        return [entry.name for entry in self.path.parent.iterdir()]
+
+    def namespaced(self, namespace: str) -> _Beside:
+        return _Beside(self.path.parent / namespace / self.path.name)
+
+
+def _check_gltf(path: Path, data: bytes) -> None:
+    """Refuse arrays that are not stored plainly, in whose place trimesh would put zeros."""
+    if path.suffix.lower() == ".glb":
+        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    for accessor in json.loads(data).get("accessors", ()):
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise DataError(
+                f"{path} holds compressed or sparse arrays, which are not read; export it without "
+                "compression."
+            )
+
+
+def _parts(path: Path, loaded: trimesh.parent.Geometry) -> list[trimesh.parent.Geometry]:
     """The meshes and clouds of a file, placed as its scene says, in the order of the file."""
     if not isinstance(loaded, trimesh.Scene):
         found = [loaded]
@@ -157,6 +199,9 @@ def _parts(loaded: trimesh.parent.Geometry) -> list[trimesh.parent.Geometry]:
         order = {name: rank for rank, name in enumerate(loaded.geometry)}
         placed = [(loaded.graph[node], node) for node in loaded.graph.nodes_geometry]
         placed.sort(key=lambda item: (order[item[0][1]], str(item[1])))
+        # A mesh that is placed many times is copied as often.
+        size = sum(loaded.geometry[name].vertices.nbytes for (_, name), _ in placed)
+        announced.check(path, "its scene", size, announced.limit(path.stat().st_size))
         found = [loaded.geometry[name].copy() for (_, name), _ in placed]
         for part, ((transform, _), _) in zip(found, placed, strict=True):
             part.apply_transform(transform)
@@ -258,32 +303,36 @@ def _table(path: Path, columns: tuple[int, ...]) -> np.ndarray:
 
 
 def _read_npy(path: Path) -> _Arrays:
-    with open(path, "rb") as stream:
-        # numpy.load would also take a pickle or an archive under this name.
-        array = np.lib.format.read_array(stream, allow_pickle=False)
-    return _points(path, array), None
+    # numpy.load would also take a pickle or an archive under this name.
+    return _points(path, announced.npy_array(path, path.read_bytes())), None
 
 
 def _read_npz(path: Path) -> _Arrays:
-    if not zipfile.is_zipfile(path):  # numpy.load would take a bare array or pickle instead
+    if not zipfile.is_zipfile(path):
         raise ValueError("not a zip archive")
-    with np.load(path, allow_pickle=False) as arrays:
-        return _named(path, arrays)
+    with zipfile.ZipFile(path) as archive:
+        members = {name.removesuffix(".npy"): name for name in archive.namelist()}
+        return _named(
+            path,
+            members,
+            lambda name: announced.npy_array(path, announced.member(path, archive, members[name])),
+        )
 
 
 def _read_h5(path: Path) -> _Arrays:
     with h5py.File(path, "r") as file:
-        return _named(path, _datasets(file))
+        return _named(path, file, lambda name: announced.checked(file, name)[()])
 
 
 def _read_mat(path: Path) -> _Arrays:
     if h5py.is_hdf5(path):  # MATLAB 7.3, which stores arrays column by column
         with h5py.File(path, "r") as file:
-            arrays = {name: np.asarray(array).T for name, array in _datasets(file).items()}
+            arrays = {name: announced.checked(file, name)[()].T for name in _datasets(file)}
     else:
+        content = announced.numeric_variables(path, path.read_bytes())
         arrays = {
             name: value
-            for name, value in scipy.io.loadmat(path).items()
+            for name, value in scipy.io.loadmat(content).items()
             if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
         }
     if not {"vertices", "points"} & arrays.keys():
@@ -294,27 +343,36 @@ def _read_mat(path: Path) -> _Arrays:
         ]
         if len(clouds) == 1:
             arrays["vertices"] = arrays.pop(clouds[0])
-    vertices, faces = _named(path, arrays)
+    vertices, faces = _named(path, arrays, arrays.__getitem__)
     # MATLAB counts from 1. Indices that use both ends of 1..V can mean nothing else.
     if faces is not None and faces.size and faces.min() == 1 and faces.max() == len(vertices):
         faces = faces - 1
     return vertices, faces
 
 
-def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    return {name: item for name, item in file.items() if isinstance(item, h5py.Dataset)}
+def _datasets(file: h5py.File) -> list[str]:
+    """Names of the arrays of numbers; MATLAB's texts and cells are something else."""
+    links = {name: file.get(name, getlink=True) for name in file}
+    here = [name for name, link in links.items() if isinstance(link, h5py.HardLink)]
+    items = ((name, file[name]) for name in here)
+    return [
+        name
+        for name, x in items
+        if isinstance(x, h5py.Dataset) and x.shape and x.dtype.kind in "fiu"
+    ]
 
 
-def _named(path: Path, arrays: Mapping[str, np.ndarray | h5py.Dataset]) -> _Arrays:
-    name = next((name for name in ("vertices", "points") if name in arrays), None)
+def _named(path: Path, names: Iterable[str], read: Callable[[str], np.ndarray]) -> _Arrays:
+    names = set(names)
+    name = next((name for name in ("vertices", "points") if name in names), None)
     if name is None:
-        found = ", ".join(sorted(arrays)) or "none"
+        found = ", ".join(sorted(names)) or "none"
         raise DataError(
             f"{path} has no (V, 3) array named 'vertices' or 'points' (arrays found: {found}); "
             "rename the one with the coordinates."
         )
-    faces = _face_indices(path, np.asarray(arrays["faces"])) if "faces" in arrays else None
-    return _points(path, np.asarray(arrays[name])), faces
+    faces = _face_indices(path, read("faces")) if "faces" in names else None
+    return _points(path, read(name)), faces
 
 
 def _points(path: Path, array: np.ndarray) -> np.ndarray:

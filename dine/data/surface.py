@@ -27,7 +27,7 @@ class Surface:
     name: str = "surface"
 
     def __post_init__(self):
-        vertices = np.asarray(self.vertices, dtype=np.float64)
+        vertices = self._numbers("vertices", np.float64)
         if vertices.ndim != 2 or vertices.shape[1] != 3:
             raise DataError(
                 f"{self.name}: expected vertices of shape (V, 3), found {vertices.shape}."
@@ -43,8 +43,8 @@ class Surface:
         object.__setattr__(self, "vertices", vertices)
         if self.faces is None:
             return
-        faces = np.asarray(self.faces, dtype=np.int64)
-        if len(faces) == 0:
+        faces = self._numbers("faces", np.int64)
+        if faces.size == 0:
             object.__setattr__(self, "faces", None)
             return
         if faces.ndim != 2 or faces.shape[1] != 3:
@@ -55,3 +55,9 @@ class Surface:
                 f"{len(vertices)} vertices (indices start at 0)."
             )
         object.__setattr__(self, "faces", faces)
+
+    def _numbers(self, name: str, dtype: type) -> np.ndarray:
+        try:
+            return np.asarray(getattr(self, name), dtype=dtype)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise DataError(f"{self.name}: the {name} are no array of numbers ({error}).") from None

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from dine.data.fields import get_names, opened, put_fields
+from dine.data.fields import get_names, get_numbers, get_text, opened, put_fields
 from dine.results import CLEAN
 
 FORMAT = "dine-predictions"
@@ -65,15 +65,22 @@ def read_predictions(path: Path) -> list[Prediction]:
         DataError: missing, damaged, or another kind of file.
     """
     with opened(path, FORMAT) as file:
-        found = [
-            Prediction(
-                str(group.attrs["condition"]),
-                float(group.attrs["corruption"]),
-                get_names(group),
-                group["displacement"][:],
-                *(group[name][:] if name in group else None for name in ("spread", "seconds")),
-            )
-            for group in file.values()
-        ]
+        found = [_prediction(group) for group in file.values()]
     order = {CLEAN: 0, "noise": 1, "outliers": 2}
     return sorted(found, key=lambda p: (order.get(p.condition, 3), p.corruption))
+
+
+def _prediction(group: h5py.Group) -> Prediction:
+    field = get_numbers(group, "displacement", (None, None, 3))
+    count, points, _ = field.shape
+    optional = {"spread": ((count, points), "f4"), "seconds": ((count,), "f8")}
+    corruption = float(group.attrs["corruption"])
+    if not np.isfinite(corruption):
+        raise ValueError(f"the corruption of its group {group.name!r} is {corruption}")
+    return Prediction(
+        get_text(group, "condition"),
+        corruption,
+        get_names(group, count),
+        field,
+        *(get_numbers(group, k, *v) if k in group else None for k, v in optional.items()),
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,6 +99,21 @@ class BeliefPropagationBackbone(Backbone):
                 f"The backbone's `initialisation` is {initialisation!r}; expected geometric or "
                 "default."
             )
+        counts = {
+            "candidates": candidates,
+            "source_neighbours": source_neighbours,
+            "target_neighbours": target_neighbours,
+        }
+        for name, value in counts.items():
+            if type(value) is not int or value < 1:
+                raise ConfigError(
+                    f"The backbone's `{name}` is {value!r}; expected a whole number from 1 on."
+                )
+        for name, value in {"smoothness": smoothness, "temperature": temperature}.items():
+            if type(value) not in (int, float) or not 0 <= value < math.inf:
+                raise ConfigError(
+                    f"The backbone's `{name}` is {value!r}; expected a number from 0 on."
+                )
         super().__init__(
             candidates=candidates,
             source_neighbours=source_neighbours,

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import safetensors.torch
 import torch
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from dine import __version__
-from dine.errors import CheckpointError
+from dine.data import announced
+from dine.errors import CheckpointError, ConfigError, DataError
 from dine.files import atomic_path
 from dine.models.backbones import BACKBONES, Backbone
+from dine.registry import Registry
+
+M = TypeVar("M", bound=nn.Module)
+
+# What constructors raise that get arguments of other types, or sizes below nothing.
+_MISFITS = (TypeError, ValueError, RuntimeError, OverflowError, KeyError, IndexError)
+
+_FACTORIES = ("empty", "zeros", "ones", "full", "eye", "arange", "rand", "randn", "empty_strided")
 
 BACKBONE_FORMAT = "dine-backbone"
 
@@ -79,9 +91,64 @@ def load_backbone(path: str | Path) -> tuple[Backbone, dict[str, Any]]:
         state, facts = _load_published(path)
     else:
         state, facts = load_tensors(path, BACKBONE_FORMAT)
-    backbone = BACKBONES.get(facts["backbone"])(**facts["arguments"])
-    load_state(backbone, state, path)
+    backbone = rebuilt(BACKBONES, Backbone, facts, ("backbone", "arguments"), state, path)
     return backbone, facts
+
+
+class _Budget(TorchDispatchMode):
+    """Lets a constructor make tensors for so many weights, and not for a size that a file asks for.
+
+    Some more than the weights themselves are needed while they get their first values.
+    """
+
+    def __init__(self, weights: int):
+        super().__init__()
+        self.left = 10 * weights + 1_000_000
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        if name in _FACTORIES:
+            sizes = args[0] if isinstance(args[0], list | tuple) else args[:1]
+            self.left -= math.prod(sizes) ** (2 if name == "eye" else 1)
+            if self.left < 0:
+                raise ValueError("its arguments ask for more weights than it holds")
+        return func(*args, **(kwargs or {}))
+
+
+def rebuilt(
+    registry: Registry[M],
+    base: type[M],
+    facts: dict[str, Any],
+    keys: tuple[str, str],
+    state: dict[str, torch.Tensor],
+    path: str | Path,
+) -> M:
+    """A module from a file: its class and arguments from the facts, its tensors from the state.
+
+    Args:
+        registry: of the classes.
+        base: what the class must be.
+        facts: of the file.
+        keys: where they have the name of the class and its arguments.
+        state: tensors of the file.
+        path: of the file, for messages.
+
+    Raises:
+        CheckpointError: facts or tensors that do not make a module.
+    """
+    name, arguments = (facts.get(key) for key in keys)
+    try:
+        if not isinstance(arguments, dict):
+            raise ConfigError(f"its arguments are {arguments!r}; expected names and values.")
+        with _Budget(sum(value.numel() for value in state.values())):
+            module = registry.named_in_file(name, base)(**arguments)
+    except (ConfigError, *_MISFITS) as error:
+        reason = " ".join(str(error).split())
+        raise CheckpointError(
+            f"{path} does not say how to build its {keys[0]} ({reason[:300]}); make it again."
+        ) from error
+    load_state(module, state, path)
+    return module
 
 
 def load_state(module: nn.Module, state: dict[str, torch.Tensor], path: str | Path) -> None:
@@ -118,11 +185,16 @@ def _is_torch_file(path: Path) -> bool:
 
 def _load_published(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        content = path.read_bytes()
+        announced.check_pickled_sizes(path, content)
+        # A stream in memory never takes room for more than it has.
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except DataError as error:
+        raise CheckpointError(str(error)) from None
     except Exception as error:  # a damaged file fails in as many ways as there are readers
         raise CheckpointError(
             f"{path} is not a readable PyTorch state dict of plain tensors "
-            f"({str(error).splitlines()[0]})."
+            f"({' '.join(str(error).split())[:300] or type(error).__name__})."
         ) from error
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
         raise CheckpointError(f"{path} does not hold a state dict; expected a dict of tensors.")

@@ -9,13 +9,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dine.errors import ConfigError, DataError
-from dine.models.checkpoint import load_state, load_tensors, save_tensors
+from dine.errors import CheckpointError, ConfigError, DataError
+from dine.models.checkpoint import load_tensors, rebuilt, save_tensors
 from dine.priors.gaussian import LinearGaussian
 from dine.registry import Registry
 
 PRIORS: Registry[Prior] = Registry("prior")
 PRIOR_FORMAT = "dine-prior"
+
+LARGEST_SIZE = 1_000_000
+"""Of points, components and so on: far more than any prior has."""
+
+LARGEST_DEPTH = 1000
+"""Of layers, likewise."""
 
 
 class Prior(nn.Module):
@@ -111,10 +117,26 @@ def load_prior(path: str | Path) -> Prior:
         CheckpointError: missing, damaged, or of another kind.
     """
     tensors, facts = load_tensors(path, PRIOR_FORMAT)
-    prior = PRIORS.get(facts["prior"])(**facts["shape"])
-    load_state(prior, tensors, path)
-    prior.notes = facts["notes"]
+    prior = rebuilt(PRIORS, Prior, facts, ("prior", "shape"), tensors, path)
+    notes = facts.get("notes")
+    if not isinstance(notes, dict):
+        raise CheckpointError(f"{path}: its notes are {notes!r}; make it again.")
+    prior.notes = notes
     return prior.freeze()
+
+
+def check_sizes(prior: str, largest: int = LARGEST_SIZE, **sizes: Any) -> None:
+    """Make sure that constructor arguments, which may come from a file, are sensible counts.
+
+    Raises:
+        ConfigError: naming the first that is no whole number from 1 to ``largest``.
+    """
+    for name, value in sizes.items():
+        if type(value) is not int or not 1 <= value <= largest:
+            raise ConfigError(
+                f"The {prior} prior's `{name}` is {value!r}; expected a whole number from 1 to "
+                f"{largest}."
+            )
 
 
 def check_fields(fields: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dine.priors.base import PRIORS, Prior, check_fields
+from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, check_fields, check_sizes
 
 
 @PRIORS.register("flow")
@@ -22,6 +22,8 @@ class FlowPrior(Prior):
     def __init__(self, points: int, transforms: int, hidden: int):
         import zuko  # slow to import, and other priors do not need it
 
+        check_sizes("flow", points=points, hidden=hidden)
+        check_sizes("flow", LARGEST_DEPTH, transforms=transforms)
         super().__init__(points=points, transforms=transforms, hidden=hidden)
         self.register_buffer("mean", torch.zeros(3))
         self.register_buffer("scale", torch.ones(3))

@@ -14,8 +14,8 @@ from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from dine.errors import DataError
-from dine.priors.base import PRIORS, Prior, check_fields
+from dine.errors import ConfigError, DataError
+from dine.priors.base import PRIORS, Prior, check_fields, check_sizes
 from dine.priors.gaussian import LinearGaussian, covariance_root
 from dine.priors.sources import (
     SourceCache,
@@ -88,6 +88,9 @@ class GaussianProcessPrior(Prior):
     conditional = True
 
     def __init__(self, widths: Sequence[float], rank: int):
+        check_sizes("gaussian_process", rank=rank)
+        if not all(isinstance(width, int | float) and 0 < width < math.inf for width in widths):
+            raise ConfigError(f"The widths of the process are {widths!r}; expected positive ones.")
         super().__init__(widths=list(widths), rank=rank)
         self.register_buffer("amplitudes", torch.ones(len(widths)))
         self.register_buffer("affine", torch.ones(()))

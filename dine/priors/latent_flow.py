@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dine.errors import DataError
-from dine.priors.base import PRIORS, Prior, check_fields
+from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, check_fields, check_sizes
 from dine.priors.gaussian import LinearGaussian
 from dine.priors.pca_residual import PCAResidualPrior
 from dine.priors.sources import check_sources, held_out_folds, source_labels
@@ -34,6 +34,8 @@ class LatentFlowPrior(PCAResidualPrior):
     def __init__(self, points: int, components: int, transforms: int, hidden: int):
         import zuko  # slow to import, and other priors do not need it
 
+        check_sizes("latent_flow", hidden=hidden)
+        check_sizes("latent_flow", LARGEST_DEPTH, transforms=transforms)
         super().__init__(points, components, transforms=transforms, hidden=hidden)
         self.flow = zuko.flows.RealNVP(
             features=components, transforms=transforms, hidden_features=(hidden, hidden)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dine.errors import DataError
-from dine.priors.base import PRIORS, Prior, check_fields
+from dine.priors.base import PRIORS, Prior, check_fields, check_sizes
 from dine.priors.gaussian import LinearGaussian
 
 log = logging.getLogger(__name__)
@@ -29,6 +29,7 @@ class PCAPrior(Prior):
     """
 
     def __init__(self, points: int, components: int):
+        check_sizes("pca", points=points, components=components)
         super().__init__(points=points, components=components)
         size = 3 * points
         self.register_buffer("mean", torch.zeros(size))

@@ -10,9 +10,9 @@ import torch
 from scipy.linalg import eigh
 from torch import Tensor
 
-from dine.errors import DataError
+from dine.errors import ConfigError, DataError
 from dine.geometry.graph import neighbour_graph
-from dine.priors.base import PRIORS, Prior, check_fields
+from dine.priors.base import PRIORS, Prior, check_fields, check_sizes
 from dine.priors.gaussian import LinearGaussian
 from dine.priors.sources import SourceCache, check_sources, members, one_source, source_labels
 
@@ -78,6 +78,9 @@ class SmoothnessPrior(Prior):
     conditional = True
 
     def __init__(self, neighbours: int, anchor: float):
+        check_sizes("smoothness", neighbours=neighbours)
+        if not (isinstance(anchor, float) and 0 < anchor < 1):
+            raise ConfigError(f"The anchor of the smoothness prior is {anchor!r}; expected 0 to 1.")
         super().__init__(neighbours=neighbours, anchor=anchor)
         self.register_buffer("roughness", torch.ones(()))
         self.register_buffer("magnitude", torch.ones(()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -73,9 +74,28 @@ def load_calibration(path: Path) -> Calibration:
     try:
         if content.pop("format") != CALIBRATION_FORMAT:
             raise KeyError("format")
-        return Calibration(**content)
-    except (KeyError, TypeError, AttributeError):
-        raise DataError(f"{path} is not a calibration; make one with `dine calibrate`.") from None
+        found = Calibration(**content)
+        _check(found)
+    except (KeyError, TypeError, AttributeError, ValueError):
+        raise DataError(
+            f"{path} is not a calibration, or is damaged; make one with `dine calibrate`."
+        ) from None
+    return found
+
+
+def _check(calibration: Calibration) -> None:
+    """Raise a ``ValueError`` or ``TypeError`` where a part is not what ``Calibration`` says."""
+    lists = {**calibration.reference, "error": calibration.error, "likely": calibration.likely}
+    for name, values in {**lists, "spread": calibration.spread}.items():
+        numbers = all(type(value) in (int, float) and math.isfinite(value) for value in values)
+        if not isinstance(values, list) or not values or not numbers:
+            raise ValueError(f"{name!r} is no list of numbers")
+        if name not in ("error", "likely") and values != sorted(values):
+            raise ValueError(f"{name!r} does not increase")
+    if not len(calibration.spread) == len(calibration.error) == len(calibration.likely):
+        raise ValueError("its lists have different lengths")
+    if not isinstance(calibration.facts, dict):
+        raise TypeError("its facts are no object")
 
 
 def plausibility(

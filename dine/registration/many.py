@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -45,7 +46,7 @@ def read_jobs(path: Path) -> list[Job]:
     if path.is_dir():
         inventory = scan(path)
         jobs = [
-            Job(f"{pair.level}_{pair.name}", path / pair.source, path / pair.target)
+            Job(f"{pair.level}_{pair.name}", pair.source, pair.target)
             for pair in inventory.pairs
             if pair.condition == "deformation"
         ]
@@ -117,7 +118,7 @@ def _one(
     load: Callable[[Job], dict] | None,
 ) -> dict:
     for path in (job.source, job.target):
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise DataError(f"{path} does not exist.")
     identity = digest(
         {

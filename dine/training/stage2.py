@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from dine.config import CONTROL, Compute, LambdaSearch, Stage2
@@ -25,8 +26,11 @@ def selected_lambda(path: Path, prior: str) -> float:
     result = read_json(path)
     try:
         selected = result["selected"]
-        return float(selected.get(prior, selected[result["default"]]))
-    except (KeyError, TypeError, ValueError, AttributeError):
+        weight = float(selected.get(prior, selected[result["default"]]))
+        if not 0 <= weight < math.inf:
+            raise ValueError("λ is no number from 0 on")
+        return weight
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
         raise DataError(f"{path} is not the result of `dine search-lambda`.") from None
 
 

@@ -22,8 +22,8 @@ from dine.data.synthetic import primitive
 
 ROOT = Path(__file__).parents[2]
 TINY = "config/tiny.yaml"
-# A space, since people have folders with spaces.
-RESULTS = "results/tiny run"
+# A space and more than ASCII, since people have such folders.
+RESULTS = "results/tiny rün – 1"
 
 
 def snakemake(folder, *arguments, check=True):

@@ -21,7 +21,7 @@ rule raw:
         code=code_digest("raw"),
     shell:
         "dine --log {log:q} raw --settings {params.settings:q} --seed {params.seed}"
-        ' --out "$(dirname {output.raw:q})"'
+        ' --out "$(dirname -- {output.raw:q})"'
 
 
 rule pairs:

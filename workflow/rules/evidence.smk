@@ -41,7 +41,7 @@ rule evidence_raw:
         code=code_digest("raw"),
     shell:
         "dine --log {log:q} raw --settings {params.settings:q} --first-object {params.first}"
-        ' --seed {params.seed} --out "$(dirname {output:q})"'
+        ' --seed {params.seed} --out "$(dirname -- {output:q})"'
 
 
 rule evidence_pairs:
@@ -166,7 +166,7 @@ rule stage2_method:
         " --settings {params.settings:q} --seed {params.seed}"
         " {params.compute} --processes {resources.processes}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.trained}'"
-        ' --out "$(dirname {output.model:q})"'
+        ' --out "$(dirname -- {output.model:q})"'
 
 
 rule evidence_predict:
@@ -376,4 +376,4 @@ rule evidence:
         "dine --log {log:q} evidence {input.metrics:q} {params.searches} {params.diagnostics}"
         " {params.examples}"
         " --methods {params.methods:q} --settings {params.settings:q}"
-        ' --out "$(dirname {output:q})"'
+        ' --out "$(dirname -- {output:q})"'

@@ -37,7 +37,7 @@ rule pretraining_raw:
         code=code_digest("raw"),
     shell:
         "dine --log {log:q} raw --settings {params.settings:q} --first-object {params.first}"
-        ' --seed {params.seed} --out "$(dirname {output:q})"'
+        ' --seed {params.seed} --out "$(dirname -- {output:q})"'
 
 
 rule pretraining_pairs:
@@ -118,7 +118,7 @@ rule pretrain:
         "dine --log {log:q} --threads {threads} pretrain {params.pairs}"
         " {params.targets}"
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
-        ' {params.compute} --processes {resources.processes} --out "$(dirname {output.model:q})"'
+        ' {params.compute} --processes {resources.processes} --out "$(dirname -- {output.model:q})"'
 
 
 # What `dine register` needs beside the weights: a prior, and what uncertainty means.

@@ -33,7 +33,7 @@ rule tables:
     params:
         code=code_digest("tables"),
     shell:
-        'dine --log {log:q} tables {input:q} --out "$(dirname {output.all:q})"'
+        'dine --log {log:q} tables {input:q} --out "$(dirname -- {output.all:q})"'
 
 
 rule figures:
@@ -71,7 +71,7 @@ rule figures:
         code=code_digest("figures"),
     shell:
         "dine --log {log:q} figures --results {params.results:q} --settings {params.settings:q}"
-        ' --out "$(dirname {output.figures[0]:q})"'
+        ' --out "$(dirname -- {output.figures[0]:q})"'
 
 
 rule resolved_config:
@@ -150,7 +150,7 @@ for PRIOR in CONFIG.priors:
         params:
             code=code_digest("tables"),
         shell:
-            'dine --log {log:q} tables {input:q} --out "$(dirname {output:q})"'
+            'dine --log {log:q} tables {input:q} --out "$(dirname -- {output:q})"'
 
 
 # Handles for parts of the work.

@@ -31,7 +31,7 @@ rule stage1:
         " --backbone {params.backbone:q} --settings {params.settings:q} --seed {params.seed}"
         " {params.compute} --processes {resources.processes}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/stage1'"
-        ' --out "$(dirname {output.model:q})"'
+        ' --out "$(dirname -- {output.model:q})"'
 
 
 rule fields:

@@ -28,7 +28,7 @@ rule stage2_control:
         " --model {input.model:q} --settings {params.settings:q} --seed {params.seed}"
         " {params.compute} --processes {resources.processes}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/lambda0'"
-        ' --out "$(dirname {output.model:q})"'
+        ' --out "$(dirname -- {output.model:q})"'
 
 
 rule stage2_prior:
@@ -68,4 +68,4 @@ rule stage2_prior:
         " --lambda {input.weight:q} --settings {params.settings:q} --seed {params.seed}"
         " {params.compute} --processes {resources.processes}"
         " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior_of_stage2}'"
-        ' --out "$(dirname {output.model:q})"'
+        ' --out "$(dirname -- {output.model:q})"'
