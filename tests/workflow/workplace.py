@@ -54,6 +54,11 @@ class Workplace:
         vars(other).update(vars(self), folder=folder)
         return other
 
+    def empty(self) -> None:
+        """Forget all results and Snakemake's records."""
+        for name in ("results", ".snakemake"):
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+
     def command(self, *arguments, cores: int = 2) -> list[str]:
         known = [sys.executable, "-m", "snakemake", f"-j{cores}", *map(str, arguments)]
         return [*known, "--configfile", *map(str, self.configs)]
