@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -86,6 +87,9 @@ class Workplace:
 
     def start(self, *arguments, cores: int = 2) -> subprocess.Popen:
         """Snakemake in a process group of its own; what it says goes to ``said.txt``."""
+        # What was started in the background ignores Ctrl-C, and so would its children.
+        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         with open(self.folder / "said.txt", "a") as said:
             return subprocess.Popen(
                 self.command(*arguments, cores=cores),
