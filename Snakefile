@@ -27,3 +27,4 @@ rule all:
         RESULTS / "report.html",
         expand(RESULTS / "tables" / "{table}.md", table=TABLES),
         expand(RESULTS / "figures" / "{figure}.png", figure=FIGURES),
+        kept_files(),

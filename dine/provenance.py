@@ -44,7 +44,8 @@ NEUTRAL = frozenset(
 
 _DATA = re.compile(r"""["']([\w-]+\.(?:html|csv|js|txt))["']""")
 _REGISTERED = re.compile(r"""\.register\("(\w+)"\)""")
-_INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("purelib", "platlib", "stdlib"))
+_STDLIB = sysconfig.get_paths()["stdlib"]
+_LIBRARIES = frozenset({"site-packages", "dist-packages"})
 
 
 @functools.cache
@@ -57,7 +58,7 @@ def code_digest(step: str, *classes: str) -> str:
             ``package.module:Class``.
 
     Raises:
-        ConfigError: no such class, or its module is not on the Python path.
+        ConfigError: no such class, its module is not on the Python path, or is not Python.
     """
     digest = hashlib.sha256(_command(step)[0].encode())
     for name, file in sorted(code_files(step, *classes).items()):
@@ -135,7 +136,9 @@ def _follow(module: str, roots: tuple[str, ...], found: dict[str, Path]) -> None
 
 def _own(module: str, file: Path, roots: tuple[str, ...]) -> bool:
     """Whether code belongs to ``dine`` or to the user, not to Python or a library."""
-    return module.partition(".")[0] in roots or not str(file).startswith(_INSTALLED)
+    if module.partition(".")[0] in roots:
+        return True
+    return not str(file).startswith(_STDLIB) and not _LIBRARIES.intersection(file.parts)
 
 
 def _add_data(file: Path, found: dict[str, Path]) -> None:
@@ -151,7 +154,10 @@ def _add_data(file: Path, found: dict[str, Path]) -> None:
 
 @functools.cache
 def _parsed(file: Path) -> ast.Module:
-    return ast.parse(file.read_bytes(), str(file))
+    try:
+        return ast.parse(file.read_bytes(), str(file))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise ConfigError(f"{file} cannot be read as Python: {error}.") from None
 
 
 @functools.cache

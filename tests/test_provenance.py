@@ -120,6 +120,12 @@ def test_classes_that_are_not_there_are_named(own, name):
         code_digest("fit-prior", name)
 
 
+def test_a_module_with_a_mistake_is_named(own):
+    (own / "own" / "helpers.py").write_text("def scale(:")
+    with pytest.raises(ConfigError, match=r"helpers\.py cannot be read as Python: invalid syntax"):
+        code_digest("fit-prior", "own:Mine")
+
+
 def test_the_digest_follows_the_code_of_the_package(tmp_path, monkeypatch, fresh):
     steps = [("stage1", "chamfer"), ("fit-prior", "pca"), ("fit-prior", "flow"), ("tables",)]
     package = tmp_path / "dine"

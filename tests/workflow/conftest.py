@@ -1,4 +1,3 @@
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +25,5 @@ def undisturbed(tmp_path_factory) -> Undisturbed:
     place.run("all", cores=2)
     place.trace = None
     finished = place.copy(root / "finished")
-    for name in ("results", ".snakemake"):
-        shutil.rmtree(place.folder / name)
+    place.empty()
     return Undisturbed(place, finished, root / "traces")

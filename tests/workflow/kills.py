@@ -3,9 +3,10 @@
 python tests/workflow/kills.py --kills 66 --seed 0 --record kills.csv
 
 A run without disturbance comes first. Then one after another is started and killed: a job,
-Snakemake alone (its jobs go on), or all processes at once. In the end the same command runs to its
-end, and its files must be those of the first run, bit for bit, but for the times named in
-``workplace.py``.
+Snakemake alone (its jobs go on), or all processes at once; a third of them at any moment of a run
+that begins anew, the others while a job of each step in turn is made to run. In the end the same
+command runs to its end, and its files must be those of the first run, bit for bit, but for the
+times named in ``workplace.py``.
 """
 
 import argparse
@@ -28,6 +29,8 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 VICTIMS = ("job", "snakemake", "group")
 PATIENCE = 900.0
 """Seconds after which something hangs."""
+ATTEMPTS = 3
+"""A job may be over before it is seen."""
 
 # Where the rule is called otherwise than the command.
 RULES = {
@@ -45,36 +48,44 @@ RULES = {
 
 @dataclass
 class Kill:
-    """One kill: in a step's job, ``moment`` of the usual time of such a job after its start."""
+    """One kill."""
 
     step: str
+    """In whose job; any where it is empty."""
     victim: str
     signal: int
-    moment: float
+    wait: float
+    """Seconds after such a job was seen, at most until its end; or after Snakemake's start."""
     at_once: bool = False
     """Whether the next run starts while jobs of this one still go on."""
     forced: bool = False
-    """Whether the step was finished already and forced to run once more."""
+    """Whether the step is made to run even if it is finished, and nothing after it."""
     seconds: float = float("nan")
-    """After the job was seen."""
+    """What the wait came to."""
     running: str = ""
     """All steps at that moment."""
     left: str = ""
     """Steps of jobs that went on after Snakemake's end."""
 
 
-def drawn(steps: list[str], count: int, seed: int) -> list[Kill]:
-    """``count`` kills, step by step in the order of the workflow."""
+def drawn(usual: dict[str, float], seconds: float, count: int, seed: int) -> list[Kill]:
+    """``count`` kills: a third at any moment of a run that takes ``seconds``, then step by step."""
     rng = np.random.default_rng(seed)
+    anywhere = count // 3
+    steps = [""] * anywhere
+    steps += [list(usual)[number % len(usual)] for number in range(count - anywhere)]
     return [
         Kill(
-            steps[number * len(steps) // count],
-            str(rng.choice(VICTIMS)),
+            step,
+            # Where a job is killed, Snakemake goes on with all the rest that does not need it.
+            str(rng.choice(VICTIMS if step else VICTIMS[1:])),
             int(rng.choice(SIGNALS, p=(0.5, 0.25, 0.25))),
-            float(rng.uniform()),
-            bool(rng.uniform() < 0.5),
+            # Eight such runs would get through everything, were nothing lost.
+            float(rng.uniform() * (usual[step] if step else seconds / 4)),
+            at_once=bool(rng.uniform() < 0.5),
+            forced=bool(step),
         )
-        for number in range(count)
+        for step in steps
     ]
 
 
@@ -95,12 +106,12 @@ def watch(place: Workplace, process: subprocess.Popen) -> dict[str, float]:
 
 
 def wait_for(place: Workplace, step: str, process: subprocess.Popen) -> Job | None:
-    """A running job of a step; None when Snakemake ends without one."""
+    """A running job of a step, or of any; None when Snakemake ends without one."""
     while process.poll() is None:
         for job in place.jobs():
-            if job.step == step:
+            if job.step == step or not step:
                 return job
-        time.sleep(0.02)
+        time.sleep(0.01)
     return None
 
 
@@ -111,25 +122,25 @@ def settle(place: Workplace) -> None:
         raise AssertionError(f"still running: {place.jobs()}")
 
 
-def perform(
-    place: Workplace, kill: Kill, targets: list[str], usual: dict[str, float], cores: int
-) -> bool:
+def perform(place: Workplace, kill: Kill, targets: list[str], cores: int) -> bool:
     """Start the workflow and kill it; whether there was anything to kill."""
     place.unlock()
-    force = ["-R", RULES.get(kill.step, kill.step)] if kill.forced else []
+    rule = RULES.get(kill.step, kill.step)
+    force = ["-R", rule, "--until", rule] if kill.forced else []
     process = place.start(*targets, *force, cores=cores)
-    job = wait_for(place, kill.step, process)
-    if job is None:
-        return False
     began = time.monotonic()
-    due = began + kill.moment * usual[kill.step]
-    while time.monotonic() < due and job.process.is_running():
+    job = None
+    if kill.step:
+        job = wait_for(place, kill.step, process)
+        began = time.monotonic()
+    while time.monotonic() < began + kill.wait and (job is None or job.process.is_running()):
         time.sleep(0.01)
-    if process.poll() is not None:
-        return False
-    kill.running = " ".join(sorted(job.step for job in place.jobs()))
-    kill.seconds = time.monotonic() - began
+    if kill.victim == "job" and (job is None or not job.process.is_running()):
+        job = wait_for(place, "", process)
+    running = place.jobs()
     try:
+        if process.poll() is not None or (kill.victim == "job" and job is None):
+            return False
         if kill.victim == "job":
             job.process.send_signal(kill.signal)
         elif kill.victim == "snakemake":
@@ -137,9 +148,11 @@ def perform(
         else:
             os.killpg(process.pid, kill.signal)
     except (psutil.NoSuchProcess, ProcessLookupError):  # it has just ended by itself
-        process.wait(PATIENCE)
         return False
-    process.wait(PATIENCE)
+    finally:
+        kill.seconds = time.monotonic() - began
+        kill.running = " ".join(sorted(job.step for job in running))
+        process.wait(PATIENCE)
     kill.left = " ".join(sorted(job.step for job in place.jobs()))
     if not kill.at_once:
         settle(place)
@@ -167,24 +180,26 @@ def main() -> int:
     place = Workplace(root / "run", HERE / "smallest.yaml", HERE / "kills.yaml")
     began = time.monotonic()
     usual = watch(place, place.start(*targets, cores=options.cores))
-    print(f"undisturbed: {time.monotonic() - began:.0f} s, {len(usual)} steps", flush=True)
+    seconds = time.monotonic() - began
+    print(f"undisturbed: {seconds:.0f} s, {len(usual)} steps", flush=True)
     whole = place.copy(root / "undisturbed")
-    for name in ("results", ".snakemake"):
-        shutil.rmtree(place.folder / name)
+    place.empty()
     done: list[Kill] = []
-    for kill in drawn(list(usual), options.kills, options.seed):
-        # Where nothing of a step is left to do, it is made to run once more.
-        for kill.forced in (False, True):
-            if perform(place, kill, targets, usual, options.cores):
+    for kill in drawn(usual, seconds, options.kills, options.seed):
+        for _ in range(ATTEMPTS):
+            if perform(place, kill, targets, options.cores):
                 done.append(kill)
                 break
+            if not kill.step:  # the run came to its end
+                place.empty()
         name = signal.Signals(kill.signal).name
         print(
-            f"{len(done):3} {kill.step:18} {kill.victim:9} {name} after {kill.seconds:5.1f} s"
-            f"{' (forced)' if kill.forced else ''}; running: {kill.running}; left: {kill.left}",
+            f"{len(done):3} {kill.step or 'any':18} {kill.victim:9} {name} after "
+            f"{kill.seconds:5.1f} s; running: {kill.running}; left: {kill.left}",
             flush=True,
         )
         if options.record:
+            options.record.parent.mkdir(exist_ok=True)
             pd.DataFrame(map(asdict, done)).to_csv(options.record, index=False)
     finish(place, targets, options.cores)
     odd = differences(whole.results, place.results)

@@ -8,20 +8,19 @@ from workplace import differences
 
 # Each at another stage of a job: Python starting, computing, writing.
 KILLS = [
-    Kill("raw", "group", signal.SIGKILL, 0.9),
-    Kill("stage1", "job", signal.SIGKILL, 0.8),
-    Kill("stage1", "group", signal.SIGTERM, 0.9),
-    Kill("stage2", "snakemake", signal.SIGKILL, 0.6, at_once=True),
+    Kill("raw", "group", signal.SIGKILL, 1.0),
+    Kill("stage1", "job", signal.SIGKILL, 2.2),
+    Kill("stage1", "group", signal.SIGTERM, 2.5),
+    Kill("stage2", "snakemake", signal.SIGKILL, 1.5, at_once=True),
     Kill("predict", "group", signal.SIGINT, 0.5),
 ]
-USUAL = dict.fromkeys(("raw", "stage1", "stage2", "predict"), 2.5)
 
 
 @pytest.fixture(scope="module")
 def killed(undisturbed):
     """The run of ``undisturbed`` again, one job at a time, with kills; the command's last words."""
     for kill in KILLS:
-        assert perform(undisturbed.place, kill, ["all"], USUAL, cores=1), kill
+        assert perform(undisturbed.place, kill, ["all"], cores=1), kill
     return finish(undisturbed.place, ["all"], cores=1)
 
 

@@ -128,6 +128,10 @@ EDITS |= {
         without("eggs/affine/stage2/vectors/metrics.csv"),
         Counter(evaluate=1) + SHOWN,
     ),
+    "lost weights": (
+        without("eggs/affine/stage2/vectors/model.safetensors"),
+        Counter(stage2_prior=1, predict=1, evaluate=1) + SHOWN,
+    ),
     "a lost figure": (without("figures/lambda.png"), Counter(figures=1, html=1)),
 }
 

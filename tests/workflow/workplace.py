@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -54,6 +55,11 @@ class Workplace:
         vars(other).update(vars(self), folder=folder)
         return other
 
+    def empty(self) -> None:
+        """Forget all results and Snakemake's records."""
+        for name in ("results", ".snakemake"):
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+
     def command(self, *arguments, cores: int = 2) -> list[str]:
         known = [sys.executable, "-m", "snakemake", f"-j{cores}", *map(str, arguments)]
         return [*known, "--configfile", *map(str, self.configs)]
@@ -81,6 +87,9 @@ class Workplace:
 
     def start(self, *arguments, cores: int = 2) -> subprocess.Popen:
         """Snakemake in a process group of its own; what it says goes to ``said.txt``."""
+        # What was started in the background ignores Ctrl-C, and so would its children.
+        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         with open(self.folder / "said.txt", "a") as said:
             return subprocess.Popen(
                 self.command(*arguments, cores=cores),

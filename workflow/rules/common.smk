@@ -218,6 +218,26 @@ def calibrating_prior(wildcards):
     ]
 
 
+def kept_files():
+    """What `all` makes on its way; named as its inputs so that a deleted file is made again."""
+    found = [FILES.search]
+    for dataset in CONFIG.datasets:
+        names = ("raw.json", "pairs.h5", "agreement.json")
+        found += [FILES.dataset(dataset, name) for name in names]
+        found += [
+            FILES.variant(dataset, *condition)
+            for condition in conditions(CONFIG, dataset)
+        ]
+        for backbone, settings in CONFIG.backbones.items():
+            if settings.priors:
+                found.append(FILES.dataset(dataset, f"{backbone}/dvf.h5"))
+            found += [
+                FILES.prior(dataset, backbone, prior) for prior in settings.priors
+            ]
+    names = ("model.safetensors", "predictions.h5", "metrics.csv")
+    return found + [FILES.run(*run, name) for run in RUNS for name in names]
+
+
 # --- evidence: a method's files depend on what the configuration says of it ---
 
 
