@@ -1,5 +1,6 @@
 """Devices are held by one process at a time, without a GPU: their names are injected."""
 
+import contextlib
 import os
 import platform
 import subprocess
@@ -36,82 +37,76 @@ with contextlib.ExitStack() as stack:
 """
 
 
+class Waited(Exception):
+    """Another process would be waited for."""
+
+
 @pytest.fixture
 def two(monkeypatch, tmp_path):
-    """A machine with two GPUs, of which nobody holds any."""
-    monkeypatch.setenv(devices.LEASES, str(tmp_path))
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(devices, "_names", lambda: ["GPU-0", "GPU-1"])
-    monkeypatch.setattr(devices, "POLL_SECONDS", 0.05)
-
-
-class Waited(Exception):
-    pass
-
-
-@pytest.fixture
-def no_waiting(monkeypatch):
-    """Where another process would be waited for, stop."""
+    """A machine with two GPUs, of which nobody holds any; who waits is stopped."""
 
     def sleep(seconds):
         raise Waited
 
+    monkeypatch.setenv(devices.LEASES, str(tmp_path))
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(devices, "_names", lambda: ["GPU-0", "GPU-1"])
     monkeypatch.setattr(devices, "time", SimpleNamespace(sleep=sleep))
 
 
+@contextlib.contextmanager
 def another_process(*names, code=HOLDING, expected="None"):
-    """A process that holds devices until its input ends."""
-    process = subprocess.Popen(
+    """A process that holds devices until the block ends."""
+    with subprocess.Popen(
         [sys.executable, "-c", code, *names],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-    )
-    for _ in names:
-        assert process.stdout.readline().strip() == expected
-    return process
-
-
-def end(process):
-    process.stdin.close()
-    process.stdout.close()
-    assert process.wait(timeout=30) in (0, -9)
+    ) as process:
+        try:
+            for _ in names:
+                assert process.stdout.readline().strip() == expected
+            yield process
+        finally:
+            process.kill()
 
 
 def test_two_processes_get_a_device_each_and_a_third_waits(two, monkeypatch, caplog):
-    first = another_process("any", code=LEASING, expected="0")
-    with devices.leased(CUDA) as [device]:
-        assert device == torch.device("cuda", 1)
-    # One is free, and two are wanted: none is kept while waiting.
-    waits = []
+    with another_process("any", code=LEASING, expected="0") as first:
+        with devices.leased(CUDA) as [device]:
+            assert device == torch.device("cuda", 1)
+        # One is free, and two are wanted: none is kept while waiting.
+        waits = []
 
-    def sleep(seconds):
-        waits.append(seconds)
-        with devices.held(devices._folder() / "GPU-1") as who:
-            assert who is None
-        if len(waits) == 3:
-            first.kill()  # without a chance to tidy up
-            first.wait()
+        def sleep(seconds):
+            waits.append(seconds)
+            with devices.held(devices._folder() / "GPU-1") as who:
+                assert who is None
+            if len(waits) == 3:
+                first.kill()  # without a chance to tidy up
+                first.wait()
+            assert len(waits) < 10
 
-    monkeypatch.setattr(devices, "time", SimpleNamespace(sleep=sleep))
-    with caplog.at_level("INFO"), devices.leased(CUDA, 2) as found:
-        assert [device.index for device in found] == [0, 1]
-    assert len(waits) == 3
-    assert caplog.text.count("waiting for 2 of 2 CUDA devices") == 1
-    assert f"0 is held by process {first.pid}" in caplog.text
-    end(first)
+        monkeypatch.setattr(devices, "time", SimpleNamespace(sleep=sleep))
+        with caplog.at_level("INFO"), devices.leased(CUDA, 2) as found:
+            assert [device.index for device in found] == [0, 1]
+        assert len(waits) == 3
+        assert caplog.text.count("waiting for 2 of 2 CUDA devices") == 1
+        assert f"0 is held by process {first.pid}" in caplog.text
 
 
-def test_a_device_is_free_after_use_and_after_an_error(two, no_waiting):
+def test_a_device_is_free_after_use_and_after_an_error(two):
     with pytest.raises(KeyError), devices.leased(CUDA, 2):
         raise KeyError
-    other = another_process("GPU-0", "GPU-1")
-    with pytest.raises(Waited), devices.leased(CUDA):
+    with (
+        another_process("GPU-0", "GPU-1"),
+        pytest.raises(Waited),
+        devices.leased(CUDA),
+    ):
         pass
-    end(other)
 
 
-def test_a_process_does_not_wait_for_itself(two, no_waiting):
+def test_a_process_does_not_wait_for_itself(two):
     with devices.leased(CUDA) as outer:
         with devices.leased(CUDA) as inner:
             assert inner == outer
@@ -121,25 +116,23 @@ def test_a_process_does_not_wait_for_itself(two, no_waiting):
         assert who is None
 
 
-def test_devices_are_told_apart_by_name_not_by_index(two, monkeypatch, no_waiting):
-    other = another_process("GPU-0")
-    # As CUDA_VISIBLE_DEVICES=1 shows it: the second device is the only one, and is number 0.
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(devices, "_names", lambda: ["GPU-1"])
-    with devices.leased(CUDA) as [device]:
-        assert device.index == 0
-    monkeypatch.setattr(devices, "_names", lambda: ["GPU-0"])
-    with pytest.raises(Waited), devices.leased(CUDA):
-        pass
-    end(other)
+def test_devices_are_told_apart_by_name_not_by_index(two, monkeypatch):
+    with another_process("GPU-0"):
+        # As CUDA_VISIBLE_DEVICES=1 shows it: the second device is the only one, and is number 0.
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+        monkeypatch.setattr(devices, "_names", lambda: ["GPU-1"])
+        with devices.leased(CUDA) as [device]:
+            assert device.index == 0
+        monkeypatch.setattr(devices, "_names", lambda: ["GPU-0"])
+        with pytest.raises(Waited), devices.leased(CUDA):
+            pass
 
 
-def test_leases_can_be_switched_off(two, monkeypatch, no_waiting):
-    other = another_process("GPU-0", "GPU-1")
+def test_leases_can_be_switched_off(two, monkeypatch, tmp_path):
     monkeypatch.setenv(devices.LEASES, "off")
-    with devices.leased(CUDA) as [device]:
-        assert device.index == 0
-    end(other)
+    monkeypatch.setattr(devices, "_folder", lambda: pytest.fail("asked for a folder"))
+    with devices.leased(CUDA, 2) as found:
+        assert [device.index for device in found] == [0, 1]
 
 
 def test_a_cpu_is_not_held(monkeypatch):
