@@ -36,7 +36,8 @@ from dine.models.checkpoint import load_backbone, save_tensors
 from dine.priors import PRIORS, load_prior
 from dine.registration.calibration import Calibration, load_calibration
 from dine.registration.many import read_jobs
-from dine.training.stages import new_backbone, selected_lambda
+from dine.training.stage2 import selected_lambda
+from dine.training.stages import new_backbone
 from dine.training.state import load_state, save_state
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))

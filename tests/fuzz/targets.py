@@ -29,11 +29,12 @@ from samples import make_pairs
 from dine import config
 from dine.cli import _alignment
 from dine.data import pairs as pairs_module
+from dine.data.corruption import make_variant
 from dine.data.dataverse import download
 from dine.data.fields import TrainingFields, read_fields, write_training_fields
 from dine.data.layout import scan
 from dine.data.obtain import obtained
-from dine.data.pairs import PAIR_DATASETS, make_variant, read_pairs, read_variant, write_pairs
+from dine.data.pairs import PAIR_DATASETS, read_pairs, read_variant, write_pairs
 from dine.data.raw import synthesise
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
@@ -42,7 +43,8 @@ from dine.models.checkpoint import load_backbone, save_backbone
 from dine.priors import PRIORS, load_prior
 from dine.registration.calibration import Calibration, load_calibration
 from dine.registration.many import read_jobs
-from dine.training.stages import new_backbone, selected_lambda
+from dine.training.stage2 import selected_lambda
+from dine.training.stages import new_backbone
 from dine.training.state import load_state, save_state
 from fuzz import mutations as m
 from fuzz.target import Target
