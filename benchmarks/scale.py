@@ -111,7 +111,6 @@ def along_the_workflow(folder: Path) -> dict:
             {
                 "number": number,
                 "seconds": cost.seconds,
-                "memory": cost.memory,
                 "bytes": size(path),
             }
         )
@@ -255,7 +254,8 @@ def extrapolated(result: dict) -> list[tuple[str, list[str]]]:
         for step, number in (("raw", every), ("pairs", every)):
             values[f"{step}: storage"] = amount(of(step, "bytes").at(number))
             values[f"{step}: time"] = duration(of(step, "seconds").at(number))
-        values["pairs: memory"] = amount(of("pairs", "memory").at(every))
+        # All columns are held until they are written.
+        values["pairs: memory, at least"] = amount(of("pairs", "bytes").at(every))
         values["training: memory"] = amount(both(result["reading"], "memory").at(count))
         values["training: time before the first step"] = duration(
             both(result["reading"], "seconds").at(count)
@@ -320,11 +320,11 @@ def render(result: dict) -> str:
     for step, (title, per) in names.items():
         first, last = result["steps"][step]
         cells = []
-        for what, show in (("seconds", duration), ("bytes", amount), ("memory", amount)):
+        for what, show in (("seconds", duration), ("bytes", amount)):
             cost = growth((first["number"], last["number"]), (first[what], last[what]))
             start = f" + {show(cost.start)}" if what != "bytes" else ""
             cells.append(show(cost.each) + start)
-        lines.append(f"| {title} | {per} | {cells[0]} | {cells[1]} | {cells[2]} |")
+        lines.append(f"| {title} | {per} | {cells[0]} | {cells[1]} | – |")
     for backbone, cost in result["training"].items():
         start = duration(cost["start"])
         lines.append(
