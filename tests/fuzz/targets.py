@@ -323,6 +323,7 @@ def priors() -> list[bytes]:
     settings = {
         "pca": {"components": 3},
         "pca_residual": {"components": 3},
+        "pca_process": {"components": 3, "rank": 8, "points": 16, "sources": 2},
         "flow": {"transforms": 2, "hidden": 4, "steps": 1},
         "latent_flow": {"components": 3, "transforms": 2, "hidden": 4, "steps": 1},
         "gaussian_process": {"rank": 8, "points": 16, "sources": 2},
