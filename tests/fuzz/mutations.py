@@ -135,9 +135,12 @@ def changed_json(value: Any, rng: np.random.Generator) -> Any:
     value = copy.deepcopy(value)
     for _ in range(int(rng.integers(1, 4))):
         spots: list[tuple[Any, Any]] = []
-        waiting = [value]
+        waiting, seen = [value], set()
         while waiting:
             part = waiting.pop()
+            if id(part) in seen:  # YAML may hold a part several times, or itself
+                continue
+            seen.add(id(part))
             keys = part if isinstance(part, dict) else range(len(part))
             for key in keys:
                 spots.append((part, key))
