@@ -167,6 +167,23 @@ def test_matching_goes_on_from_what_is_right_somewhere(pair):
     assert error(found, truth) < 1e-3
 
 
+def test_far_from_all_matches_the_first_field_counts():
+    """An organ with a long stick, whose motion does not follow from that of the rest."""
+    rng = np.random.default_rng(0)
+    along = np.linspace(1.05, 2.6, 80)
+    stick = np.column_stack([along, *0.02 * rng.normal(size=(2, 80))])
+    source = np.concatenate([organ(400, 1), stick])
+    out = np.clip(source[:, 0] - 1, 0, None)
+    truth = 0.1 * np.column_stack([0 * out, np.sin(4 * out) * out, 1 - np.cos(5 * out)])
+    far = out > 0.2
+    start = truth + 0.03 * far[:, None] * [1.0, 0.3, 0.5]
+    order = np.random.default_rng(2).permutation(len(source))
+    shared = SharedPoints(source, (source + truth)[order])
+    assert shared.matches(start).known[far].mean() < 0.1
+    found, _ = shared.grow(start, LOOSE.at(source))
+    assert error(found[far], truth[far]) < 0.1 * error(start[far], truth[far])
+
+
 def test_matches_are_mutual_close_and_like_their_neighbours():
     source = organ(200, 7)
     far = np.zeros_like(source)
