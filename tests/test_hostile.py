@@ -616,3 +616,19 @@ def test_archives_do_not_grow_without_end(tmp_path, kind):
     with pytest.raises(DownloadError, match="plausible"):
         fetch(tmp_path / "place", listing(f"a.{kind}"), zeros(kind))
     assert os.listdir(tmp_path / "place") == [f"a.{kind}"]
+
+
+def test_a_nameless_member_of_a_zip(tmp_path):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        archive.writestr("ab", "x")
+    with pytest.raises(DownloadError, match="has no name"):
+        fetch(tmp_path / "place", listing("a.zip"), stream.getvalue().replace(b"ab", b"\0b"))
+
+
+def test_a_header_of_a_tar_that_announces_too_much(tmp_path):
+    info = tarfile.TarInfo("././@LongLink")
+    info.type, info.size = tarfile.GNUTYPE_LONGNAME, 1 << 60
+    data = info.tobuf(tarfile.GNU_FORMAT) + bytes(10240)
+    with pytest.raises(DownloadError, match="cannot be unpacked"):
+        fetch(tmp_path / "place", listing("a.tar"), data)

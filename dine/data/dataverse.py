@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import hashlib
+import io
 import json
 import os
 import re
@@ -454,6 +455,14 @@ class _Limited(gzip.GzipFile):
         return content
 
 
+class _Plain(io.FileIO):
+    """Takes no memory for more than the file still holds, whatever a header announces."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        left = max(0, os.fstat(self.fileno()).st_size - self.tell())
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
 # Name, size (None for a folder), and how to open it.
 _Member = tuple[str, int | None, Callable[[], IO[bytes]]]
 
@@ -515,12 +524,14 @@ def _open_archive(path: Path) -> Iterator[list[_Member]]:
         with zipfile.ZipFile(path) as archive:
             yield [_zip_member(archive, info) for info in archive.infolist()]
     else:
-        mode = "r:" if path.suffix.lower() == ".tar" else "r:gz"
-        with (
-            open(path, "rb") as packed,
-            _Limited(packed, announced.limit(path.stat().st_size)) as stream,
-            tarfile.open(fileobj=packed if mode == "r:" else stream, mode="r:") as archive,
-        ):
+        plain = path.suffix.lower() == ".tar"
+        with contextlib.ExitStack() as opened:
+            stream: IO[bytes] = opened.enter_context(_Plain(path))
+            if not plain:
+                stream = opened.enter_context(
+                    _Limited(stream, announced.limit(path.stat().st_size))
+                )
+            archive = opened.enter_context(tarfile.open(fileobj=stream, mode="r:"))
             yield [_tar_member(archive, info) for info in archive.getmembers()]
 
 
@@ -529,6 +540,8 @@ def _zip_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _Member:
     name, kind = info.orig_filename, stat.S_IFMT(info.external_attr >> 16)
     if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
         raise ValueError(f"{name!r} is a link or a device")
+    if not info.filename:
+        raise ValueError(f"its member {name!r} has no name")
     return name, None if info.is_dir() else info.file_size, lambda: archive.open(info)
 
 
