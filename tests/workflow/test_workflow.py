@@ -291,7 +291,7 @@ def test_from_meshes_of_ones_own_to_a_registration(tmp_path, monkeypatch):
     used = dict(zip(register[7::2], register[8::2], strict=True))
     made = [used[option] for option in ("--weights", "--prior", "--calibration")]
     jobs = planned(folder, *train[2:], "smaller.yaml")
-    assert jobs["stage1"] == jobs["resample"] == 1
+    assert jobs["stage1"] == jobs["calibration_targets"] == 1
     # Without tables and figures, which other tests make.
     snakemake(folder, *made, *train[4:], "smaller.yaml")
     facts = json.loads(Path(used["--calibration"]).read_text())["facts"]
