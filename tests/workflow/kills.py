@@ -29,6 +29,8 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 VICTIMS = ("job", "snakemake", "group")
 PATIENCE = 900.0
 """Seconds after which something hangs."""
+STUCK = 300.0
+"""Seconds after which Snakemake, asked to end, will not."""
 ATTEMPTS = 3
 """A job may be over before it is seen."""
 
@@ -105,6 +107,16 @@ def watch(place: Workplace, process: subprocess.Popen) -> dict[str, float]:
     return {step: float(np.mean(span)) for step, span in spans.items()}
 
 
+def end(process: subprocess.Popen) -> None:
+    """Wait for Snakemake's end, as a user would: not for ever."""
+    try:
+        process.wait(STUCK)
+    except subprocess.TimeoutExpired:
+        # Its handler of SIGTERM takes a lock that the interrupted code may hold (9.27.1).
+        process.kill()
+        process.wait(PATIENCE)
+
+
 def wait_for(place: Workplace, step: str, process: subprocess.Popen) -> Job | None:
     """A running job of a step, or of any; None when Snakemake ends without one."""
     while process.poll() is None:
@@ -152,7 +164,7 @@ def perform(place: Workplace, kill: Kill, targets: list[str], cores: int) -> boo
     finally:
         kill.seconds = time.monotonic() - began
         kill.running = " ".join(sorted(job.step for job in running))
-        process.wait(PATIENCE)
+        end(process)
     kill.left = " ".join(sorted(job.step for job in place.jobs()))
     if not kill.at_once:
         settle(place)
