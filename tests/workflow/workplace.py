@@ -139,12 +139,14 @@ TIMED_FOLDERS = ("logs", "benchmarks", "training")
 """Logs and Snakemake's benchmarks; ``training/`` is the state, whose history has seconds."""
 TIMED_KEYS = ("training_seconds", "wall_seconds", "seconds")
 """Of ``run.json`` and other JSON files."""
-TIMED_COLUMNS = ("seconds",)
-"""Of ``history.csv`` and ``metrics.csv``."""
+TIMED_COLUMNS = ("seconds", "seconds_mean", "seconds_sd", "seconds_seed_sd")
+"""Of ``history.csv`` and ``metrics.csv``, and of the evidence's tables of means."""
+TIMED_ATTRIBUTES = ("predictions",)
+"""Of a refined ``predictions.h5``: the digest of the network's own, which holds seconds."""
 TIMED_DATASETS = ("seconds",)
 """Of ``predictions.h5``."""
-TIMED_FILES = ("report.html",)
-"""It shows how long trainings took."""
+TIMED_FILES = ("report.html", "evidence/report.html", "evidence/tables/all.md")
+"""They show how long trainings and pairs took; the tables of the latter are compared as CSV."""
 
 
 def content(path: Path):
@@ -174,7 +176,8 @@ def _untimed_datasets(path: Path) -> dict[str, str]:
             item = file[name]
             if name.split("/")[-1] not in TIMED_DATASETS:
                 value = item[()].tolist() if isinstance(item, h5py.Dataset) else None
-                found[name] = repr((value, sorted(map(repr, item.attrs.items()))))
+                kept = {k: v for k, v in item.attrs.items() if k not in TIMED_ATTRIBUTES}
+                found[name] = repr((value, sorted(map(repr, kept.items()))))
     return found
 
 
@@ -185,7 +188,7 @@ def files(results: Path) -> dict[str, Path]:
         name = path.relative_to(results)
         if any(part in TIMED_FOLDERS for part in name.parts) or path.suffix == ".lock":
             continue
-        if path.is_file() and path.name not in TIMED_FILES:
+        if path.is_file() and name.as_posix() not in TIMED_FILES:
             found[str(name)] = path
     return found
 
