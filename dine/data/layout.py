@@ -133,8 +133,8 @@ def scan(folder: str | os.PathLike) -> Inventory:
         return _listed(folder)
     if not os.path.isdir(folder):  # also where the name cannot be that of a folder
         raise DataError(
-            f"{folder} is not a folder; expected a dataset with Source_ and Target_ files, or a "
-            "folder of meshes."
+            f"{folder} is not a folder; expected a dataset with Source_ and Target_ files, a "
+            "folder of meshes, or the CSV file of a list of pairs."
         )
     inventory = Inventory(folder)
     files, split_files = [], []

@@ -217,12 +217,13 @@ def calibrate(
         if len(pairs) == 0:
             raise DataError(f"There are no {split} pairs to calibrate with.")
         measured[split] = _measure(backbone, fitted, pairs, seen, device, f"calibration, {split}")
+        if np.median(measured[split][1]) < _EXACT:
+            raise DataError(
+                "Sources and targets hold the same points, which are matched exactly, so there are "
+                "no errors to learn from; give targets of other points (`dine resample`, "
+                "`--targets`)."
+            )
     spread, error, reference = measured["val"]
-    if np.median(error) < _EXACT:
-        raise DataError(
-            "Sources and targets hold the same points, which are matched exactly, so there are no "
-            "errors to learn from; give targets of other points (`dine resample`, `--targets`)."
-        )
     edges = np.unique(np.quantile(spread, np.linspace(0, 1, _BINS + 1)))
     if len(edges) < 3:
         raise DataError("All points moved alike; there is nothing to learn errors from.")

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 
 from dine.cli import cli
 from dine.data.deformation import rbf_displacement
+from dine.data.pairs import read_pairs
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.data.synthetic import primitive
@@ -255,6 +256,38 @@ def test_the_dag_can_be_drawn(tmp_path):
     folder = copy_workflow(tmp_path)
     assert snakemake(folder, "all", "--dag").stdout.startswith("digraph")
     assert "stage2_prior" in snakemake(folder, "all", "--rulegraph", "mermaid-js").stdout
+
+
+def test_a_list_of_pairs_is_a_test_set(tmp_path):
+    folder = copy_workflow(tmp_path)
+    shape = primitive(0, 0)
+    write_surface(folder / "before.ply", shape)
+    write_surface(folder / "after.ply", Surface(shape.vertices * [1.1, 1, 1], shape.faces))
+    (folder / "pairs.csv").write_text("source,target,level\nbefore.ply,after.ply,0.1\n")
+    mine = {"folder": "pairs.csv", "networks": "synbench"}
+    arguments = changed(folder, {"evidence": {"test_sets": {"mine": mine}}})[1:]
+    made = Path(RESULTS) / "evidence" / "mine"
+    snakemake(folder, made / "variants" / "resampled_1.h5", *arguments)
+    pairs = read_pairs(folder / made / "pairs.h5", split="test")
+    assert pairs.attributes["origin"] == "path"
+    assert pairs.level.tolist() == [0.1]
+    assert np.abs(pairs.target[..., 1:] - pairs.source[..., 1:]).max() < 1e-6
+    # Evaluated with the networks of the other dataset; corrupted by nothing.
+    jobs = planned(folder, made / "examples.png", *arguments)
+    assert jobs["stage1"] == 1
+    assert "evidence_corrupt" not in jobs
+    assert "evidence_raw" not in jobs
+    # A change of a listed file is seen.
+    write_surface(folder / "after.ply", Surface(shape.vertices * [1.2, 1, 1], shape.faces))
+    assert planned(folder, made / "pairs.h5", *arguments)["evidence_raw"] == 1
+
+
+def test_no_examples_are_drawn_where_none_are_asked_for(tmp_path):
+    folder = copy_workflow(tmp_path)
+    arguments = changed(folder, {"evidence": {"examples": []}})[1:]
+    jobs = planned(folder, "evidence", *arguments)
+    assert jobs["evidence"] == 1
+    assert "evidence_examples" not in jobs
 
 
 def commands(page):

@@ -417,13 +417,13 @@ def cell_options(cells, predictions):
     return f"{options('--method', methods)} {options('--predictions', predictions)}"
 
 
-def example_cells(wildcards):
+def example_cells(dataset):
     """What is drawn of a dataset: with the backbone of the search and the first seed."""
     place = (CONFIG.lambda_search.backbone, CONFIG.evidence.seeds[0])
     some = [
         cell
         for backbone, seed in (place, (NO_BACKBONE, 0))
-        for cell in GROUPS.get((wildcards.dataset, backbone, seed), ())
+        for cell in GROUPS.get((dataset, backbone, seed), ())
     ]
     found = {cell.method: cell for cell in some}
     return [found[name] for name in CONFIG.evidence.examples if name in found]
@@ -431,7 +431,11 @@ def example_cells(wildcards):
 
 def evidence_examples():
     datasets = dict.fromkeys(dataset for dataset, _, _ in GROUPS)
-    return [FILES.evidence(dataset, "examples.png") for dataset in datasets]
+    return [
+        FILES.evidence(dataset, "examples.png")
+        for dataset in datasets
+        if example_cells(dataset)
+    ]
 
 
 def evidence_example_options(wildcards, input):

@@ -323,7 +323,7 @@ rule evidence_diagnose:
 
 rule evidence_examples:
     input:
-        predictions=lambda wildcards: cell_predictions(example_cells(wildcards)),
+        predictions=lambda wildcards: cell_predictions(example_cells(wildcards.dataset)),
         pairs=evidence_pairs_file,
         variants=evidence_variants,
     output:
@@ -338,7 +338,7 @@ rule evidence_examples:
     params:
         variants=variant_options,
         runs=lambda wildcards, input: cell_options(
-            example_cells(wildcards), input.predictions
+            example_cells(wildcards.dataset), input.predictions
         ),
         methods=evidence_method_texts(),
         code=code_digest("examples"),
