@@ -1,8 +1,11 @@
+import importlib
 import json
 from pathlib import Path
 
 import pytest
 from commands import RAW, STAGE1, STAGE2, dine
+
+from dine import provenance
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -45,3 +48,26 @@ def chain(tmp_path_factory):
         *("--settings", '{"candidates": [0.001, 0.1], "steps": 2, "validation_pairs": 1}'),
     )
     return root
+
+
+@pytest.fixture
+def fresh(monkeypatch):
+    """Forget before and after what was found out about code; call it to forget again."""
+
+    def forget():
+        for found in (
+            provenance.code_digest,
+            provenance.code_files,
+            provenance._command,
+            provenance._registered,
+            provenance._parsed,
+            provenance._imported,
+            provenance._source,
+        ):
+            found.cache_clear()
+        importlib.invalidate_caches()
+
+    forget()
+    yield forget
+    monkeypatch.undo()
+    forget()

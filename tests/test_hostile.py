@@ -33,12 +33,12 @@ from dine.evaluation.predictions import Prediction, read_predictions
 from dine.files import read_json
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import load_backbone, save_tensors
+from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior
 from dine.registration.calibration import Calibration, load_calibration
 from dine.registration.many import read_jobs
 from dine.training.stage2 import selected_lambda
 from dine.training.stages import new_backbone
-from dine.training.state import load_state, save_state
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
 HUGE = 10**10

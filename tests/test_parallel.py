@@ -11,10 +11,10 @@ from test_training import IDENTITY, SETTINGS, Exploding, toy_pairs
 
 from dine.errors import ConfigError, DineError
 from dine.models.backbones import Backbone, Registration
+from dine.models.state import Interrupted, load_state, one_writer
 from dine.training import loop, parallel
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
-from dine.training.state import Interrupted, load_state, one_writer
 
 ROUNDING = 1e-5
 """Of what was learned: float32 gradients agree to some 1e-7, and Adam's steps are their ratios."""

@@ -1,6 +1,9 @@
 """One set of checks for every registered prior, and closed forms for each."""
 
+import dataclasses
 import math
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -11,8 +14,10 @@ from sklearn.covariance import shrunk_covariance
 from dine.config import PriorConfig, check_arguments
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.geometry.graph import neighbour_graph
-from dine.priors import PRIORS, LatentFlowPrior, load_prior
+from dine.models.state import Interrupted, load_state
+from dine.priors import PRIORS, LatentFlowPrior, likelihood, load_prior
 from dine.priors.gaussian import squared_exponential
+from dine.priors.likelihood import Unfinished
 from dine.priors.sources import SourceCache, held_out_folds, source_labels
 
 POINTS = 20
@@ -138,8 +143,9 @@ def test_fields_that_say_nothing(name):
 @pytest.mark.parametrize("name", PRIORS.names())
 def test_the_configuration_knows_the_arguments(name):
     arguments = check_arguments(PriorConfig(kind=name))
+    given = ("seed", "source", "unfinished")
     defaults = PRIORS.get(name).fit.__kwdefaults__
-    defaults = {key: value for key, value in defaults.items() if key not in ("seed", "source")}
+    defaults = {key: value for key, value in defaults.items() if key not in given}
     assert {key: tuple(v) if isinstance(v, list) else v for key, v in arguments.items()} == defaults
 
 
@@ -710,6 +716,62 @@ def test_flow_learns_the_data_better_than_an_unfitted_flow():
     quick = PRIORS.get("flow").fit(fields, steps=1, hidden=32, transforms=3)
     longer = PRIORS.get("flow").fit(fields, steps=150, hidden=32, transforms=3)
     assert longer.notes["nll_held_out"] < quick.notes["nll_held_out"] - 0.1
+
+
+IN_STEPS = {
+    "flow": {"steps": 40, "hidden": 16, "transforms": 3},
+    # Learns by heart from its first steps, so patience ends it before its steps do.
+    "latent_flow": {"components": 6, "steps": 90, "patience": 30, "learning_rate": 1e-2},
+}
+
+
+@pytest.mark.parametrize("at", [(5,), (10, 23)])
+@pytest.mark.parametrize("name", IN_STEPS)
+def test_a_fit_that_was_stopped_goes_on_bit_for_bit(tmp_path, monkeypatch, caplog, name, at):
+    caplog.set_level("INFO", "dine")
+    fields = np.random.default_rng(0).normal(size=(40, POINTS, 3))
+    whole = PRIORS.get(name).fit(fields, seed=3, **IN_STEPS[name])
+    unfinished = Unfinished(tmp_path, {"seed": "3"}, "mine", save_seconds=1e9)
+    keywords = IN_STEPS[name] | {"unfinished": unfinished}
+    look = likelihood.Progress.update
+
+    def stop(progress, *arguments, **values):
+        look(progress, *arguments, **values)
+        if progress.done == at[0]:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    for step in at:
+        at = (step,)
+        monkeypatch.setattr(likelihood.Progress, "update", stop)
+        with pytest.raises(Interrupted, match=f"mine was stopped after step {step} of"):
+            PRIORS.get(name).fit(fields, seed=3, **keywords)
+    monkeypatch.setattr(likelihood.Progress, "update", look)
+    again = PRIORS.get(name).fit(fields, seed=3, **keywords)
+    assert f"mine: going on from step {step}" in caplog.text
+    assert again.notes == whole.notes
+    assert again.notes.get("steps", 0) < 60  # that patience ended it
+    for key, value in whole.state_dict().items():
+        assert torch.equal(again.state_dict()[key], value), key
+    # What another fit left is not gone on with.
+    other = dataclasses.replace(unfinished, identity={"seed": "4"})
+    PRIORS.get(name).fit(fields, seed=4, **(keywords | {"unfinished": other}))
+    assert "made with other seed and is not used" in caplog.text
+
+
+@pytest.mark.parametrize("name", IN_STEPS)
+def test_a_fit_saves_its_state_now_and_then(tmp_path, monkeypatch, name):
+    steps = []
+    save = likelihood.save_state
+
+    def saved(path, state):
+        save(path, state)
+        steps.append(load_state(path, state["identity"])[0]["step"])
+
+    monkeypatch.setattr(likelihood, "save_state", saved)
+    unfinished = Unfinished(tmp_path, {}, "mine", save_seconds=0)
+    fields = smooth_fields(20)
+    PRIORS.get(name).fit(fields, unfinished=unfinished, **(IN_STEPS[name] | {"steps": 4}))
+    assert steps == [1, 2, 3]
 
 
 def test_damaged_and_foreign_files(tmp_path):

@@ -1,6 +1,5 @@
 """Digests that decide what is made again."""
 
-import importlib
 import os
 import re
 import shutil
@@ -13,29 +12,6 @@ import pytest
 from dine import cli, provenance
 from dine.errors import ConfigError
 from dine.provenance import code_digest, code_files, folder_signature, versions
-
-
-@pytest.fixture
-def fresh(monkeypatch):
-    """Forget before and after what was found out about code."""
-
-    def forget():
-        for found in (
-            code_digest,
-            code_files,
-            provenance._command,
-            provenance._registered,
-            provenance._parsed,
-            provenance._imported,
-            provenance._source,
-        ):
-            found.cache_clear()
-        importlib.invalidate_caches()
-
-    forget()
-    yield forget
-    monkeypatch.undo()
-    forget()
 
 
 def code_of(*step):

@@ -25,11 +25,11 @@ from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.evaluation.quality import chamfer
 from dine.files import read_json
 from dine.models.inference import predict_fields
-from dine.priors import load_prior
+from dine.models.state import one_writer
+from dine.priors import FlowPrior, load_prior
 from dine.training import stages
 from dine.training.data_terms import DATA_TERMS
 from dine.training.stage2 import selected_lambda
-from dine.training.state import one_writer
 
 
 def test_stage1_writes_weights_history_and_record(chain):
@@ -213,6 +213,49 @@ def test_results_that_are_no_longer_asked_for_are_not_written(chain, tmp_path, m
     dine(*command, STAGE1)
     same = (chain / "stage1" / "model.safetensors").read_bytes()
     assert (tmp_path / "model.safetensors").read_bytes() == same
+
+
+FLOW = {"kind": "flow", "arguments": {"steps": 100000, "hidden": 8, "transforms": 2}}
+
+
+def test_the_fit_of_a_flow_is_a_training(chain, tmp_path):
+    out, folder = tmp_path / "flow.safetensors", tmp_path / "training" / "flow"
+    command = [sys.executable, "-m", "dine", "--threads", "1", "fit-prior", "--out", out]
+    command += ["--fields", chain / "dvf.h5", "--settings", json.dumps(FLOW)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    wait_for(folder / "lock.holder")
+    refused = subprocess.run(command, stderr=subprocess.PIPE, text=True)
+    assert f"{folder} is in use by process {process.pid} on" in refused.stderr
+    process.terminate()
+    assert "flow prior was stopped after step" in process.communicate(timeout=60)[1]
+    step = torch.load(folder / "state.pt", weights_only=True)["step"]
+    assert not out.exists()
+    again = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    wait_for(folder / "lock.holder")
+    again.terminate()
+    assert f"flow prior: going on from step {step}" in again.communicate(timeout=60)[1]
+
+
+def test_a_flow_that_is_no_longer_asked_for_is_not_written(chain, tmp_path, monkeypatch):
+    command = ("fit-prior", "--fields", chain / "dvf.h5", "--out", tmp_path / "flow.safetensors")
+    settings = json.dumps(FLOW | {"arguments": FLOW["arguments"] | {"steps": 3}})
+    fit = FlowPrior.fit
+
+    def disturbed(*arguments, unfinished, **keywords):
+        monkeypatch.setattr(FlowPrior, "fit", fit)
+        prior = fit(*arguments, unfinished=unfinished, **keywords)
+        with one_writer(unfinished.folder, {}), pytest.raises(DineError, match="is in use by"):
+            dine(*command, "--settings", json.dumps(FLOW))
+        return prior
+
+    monkeypatch.setattr(FlowPrior, "fit", disturbed)
+    with pytest.raises(DineError, match="flow prior is finished, but was asked for with other"):
+        dine(*command, "--settings", settings)
+    assert not (tmp_path / "flow.safetensors").exists()
+    dine(*command, "--settings", settings)
+    assert load_prior(tmp_path / "flow.safetensors").notes["samples"] == len(
+        read_fields(chain / "dvf.h5").source
+    )
 
 
 def test_predictions_and_metrics(chain, tmp_path):

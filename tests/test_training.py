@@ -15,12 +15,12 @@ from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
 from dine.models.backbones import Backbone, Registration
 from dine.models.devices import chosen_device
+from dine.models.state import Interrupted, one_writer
 from dine.priors import PRIORS
 from dine.training import loop
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
 from dine.training.stages import new_backbone
-from dine.training.state import Interrupted, one_writer
 
 IDENTITY = {"settings": "a", "inputs": "b", "code": "c"}
 SETTINGS = Training(steps=6, validate_every=3, validation_pairs=2, save_seconds=1e-9)

@@ -33,7 +33,9 @@ class Prior(nn.Module):
     saved.
 
     Some priors are conditioned on the source, p(D | X). They set ``conditional`` and raise a
-    ``ConfigError`` where the source is left out; the others ignore it.
+    ``ConfigError`` where the source is left out; the others ignore it. Some are fitted in many
+    steps. They set ``resumable``, and their :meth:`fit` takes ``unfinished``, which says where its
+    state is kept (:func:`dine.priors.likelihood.maximise_likelihood`).
 
     Attributes:
         shape: constructor arguments, stored beside the tensors.
@@ -42,6 +44,7 @@ class Prior(nn.Module):
 
     registered_name: str
     conditional: bool = False
+    resumable: bool = False
 
     def __init__(self, **shape: Any):
         super().__init__()

@@ -5,20 +5,28 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dine.config import PriorConfig, check_arguments
 from dine.data.fields import read_fields
 from dine.errors import DataError
-from dine.files import file_digest
+from dine.files import digest, file_digest
+from dine.models.state import check_still_wanted
 from dine.priors import PRIORS
+from dine.priors.likelihood import Unfinished
+from dine.provenance import code_digest
 
 log = logging.getLogger(__name__)
 
 
 def fit_prior(fields: list[Path], prior: PriorConfig, *, seed: int, out: Path) -> None:
-    """Fit a prior to dumped fields, of one or more files, and write it, frozen."""
+    """Fit a prior to dumped fields, of one or more files, and write it, frozen.
+
+    One that is fitted in many steps keeps its state in ``training/<name>/`` beside ``out``, goes on
+    from there, and is not written where it was asked for with something else while it was fitted.
+    """
     arguments = check_arguments(prior)
     began = time.monotonic()
     parts = [read_fields(path) for path in fields]
@@ -34,9 +42,22 @@ def fit_prior(fields: list[Path], prior: PriorConfig, *, seed: int, out: Path) -
         order = np.tile(np.arange(displacement.shape[1]), (len(displacement), 1))
         order = np.random.default_rng([6, seed]).permuted(order, axis=1)
         displacement = np.take_along_axis(displacement, order[..., None], axis=1)
-    fitted = PRIORS.get(prior.kind).fit(displacement, seed=seed, source=source, **arguments)
+    cls = PRIORS.get(prior.kind)
+    digests = [file_digest(path) for path in fields]
+    resume: dict[str, Any] = {}
+    if cls.resumable:
+        identity = {
+            "settings": digest(prior.model_dump()),
+            "seed": str(seed),
+            "inputs": digest(digests),
+            "code": code_digest("fit-prior", prior.kind),
+        }
+        folder = out.parent / "training" / out.stem
+        resume = {"unfinished": Unfinished(folder, identity, f"{out.stem} prior")}
+    fitted = cls.fit(displacement, seed=seed, source=source, **arguments, **resume)
     # Where a prior is used on other points, these must be brought into its order.
     fitted.notes["convention"] = parts[0].convention if prior.fields != "shuffled" else "none"
-    digests = [file_digest(path) for path in fields]
+    if resume:
+        check_still_wanted(folder, identity, f"{out.stem} prior")
     fitted.save(out, arguments=arguments, fields=digests, fitted_to=prior.fields, seed=seed)
     log.info("fitted the %s prior in %.1f s", prior.kind, time.monotonic() - began)

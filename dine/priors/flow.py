@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, check_fields, check_sizes
+from dine.priors.likelihood import Unfinished, maximise_likelihood
 
 
 @PRIORS.register("flow")
@@ -18,6 +19,8 @@ class FlowPrior(Prior):
     Penalty and log probability are means over the valid points, as in the paper: with N points the
     joint log density under independence is N times :meth:`log_prob`.
     """
+
+    resumable = True
 
     def __init__(self, points: int, transforms: int, hidden: int):
         import zuko  # slow to import, and other priors do not need it
@@ -43,13 +46,16 @@ class FlowPrior(Prior):
         steps: int = 600,
         batch_size: int = 2048,
         learning_rate: float = 1e-3,
+        unfinished: Unfinished | None = None,
     ) -> Self:
         """Maximum likelihood on the pooled vectors of (K, N, 3) fields, whatever their sources.
 
         A tenth of the fields is held out; ``notes`` keeps both negative log-likelihoods.
+        ``unfinished`` is where the fit's state is kept.
 
         Raises:
             DataError: fewer than two fields or a bad shape.
+            Interrupted: SIGTERM or SIGINT came, and the state is saved.
         """
         fields = check_fields(fields)
         order = np.random.default_rng(seed).permutation(len(fields))
@@ -62,17 +68,21 @@ class FlowPrior(Prior):
         prior.mean.copy_(pool.mean(0))
         prior.scale.copy_(pool.std(0).clamp_min(1e-6))
 
-        generator = torch.Generator().manual_seed(seed)
+        def draw(generator: torch.Generator) -> Tensor:
+            return pool[torch.randint(len(pool), (count,), generator=generator)]
+
+        count = min(batch_size, len(pool))
         optimiser = torch.optim.AdamW(prior.flow.parameters(), lr=learning_rate)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-        for _ in range(steps):
-            index = torch.randint(len(pool), (min(batch_size, len(pool)),), generator=generator)
-            loss = -prior._log_density(pool[index]).mean()
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(prior.flow.parameters(), 1.0)
-            optimiser.step()
-            schedule.step()
+        maximise_likelihood(
+            prior.flow,
+            prior._log_density,
+            draw,
+            optimiser,
+            steps=steps,
+            seed=seed,
+            schedule=torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps),
+            unfinished=unfinished,
+        )
         prior.freeze()
         prior.notes = {
             "samples": len(fields),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from typing import Self
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from dine.errors import DataError
 from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, check_fields, check_sizes
 from dine.priors.gaussian import LinearGaussian
+from dine.priors.likelihood import Best, Unfinished, maximise_likelihood
 from dine.priors.pca_residual import PCAResidualPrior
 from dine.priors.sources import check_sources, held_out_folds, source_labels
 
@@ -30,6 +30,8 @@ class LatentFlowPrior(PCAResidualPrior):
 
     Buffers: those of :class:`PCAResidualPrior`. Parameters: those of the flow.
     """
+
+    resumable = True
 
     def __init__(self, points: int, components: int, transforms: int, hidden: int):
         import zuko  # slow to import, and other priors do not need it
@@ -64,6 +66,7 @@ class LatentFlowPrior(PCAResidualPrior):
         batch_size: int = 64,
         learning_rate: float = 3e-4,
         weight_decay: float = 0.1,
+        unfinished: Unfinished | None = None,
     ) -> Self:
         """Maximum likelihood on nine tenths of the (K, N, 3) fields; the best held-out state wins.
 
@@ -73,10 +76,12 @@ class LatentFlowPrior(PCAResidualPrior):
         sources (K, N, 3) are given, all fields of a source are held out or none.
 
         ``notes`` has negative log-likelihoods of y per component: of the fields of the fit, of the
-        held-out ones, and of these under the Gaussian.
+        held-out ones, and of these under the Gaussian. ``unfinished`` is where the state of the
+        flow's fit is kept.
 
         Raises:
             DataError: fewer than four fields, a bad shape, or fields that are all equal.
+            Interrupted: SIGTERM or SIGINT came, and the state is saved.
         """
         fields = check_fields(fields)
         if source is not None:
@@ -97,34 +102,33 @@ class LatentFlowPrior(PCAResidualPrior):
             prior.whitened(prior.latent(torch.from_numpy(part).to(prior.mean)))
             for part in (fields[~held], fields[held])
         )
-        gaussian = prior._negative_log_likelihood(unseen)
+        best = Best(
+            prior.flow, lambda: prior._negative_log_likelihood(unseen), CHECK_EVERY, patience
+        )
+        gaussian = best.value
 
-        generator = torch.Generator().manual_seed(seed)
+        def draw(generator: torch.Generator) -> Tensor:
+            return seen[torch.randperm(len(seen), generator=generator)[:batch_size]]
+
         optimiser = torch.optim.AdamW(
             prior.flow.parameters(), lr=learning_rate, weight_decay=weight_decay
         )
-        best, best_step, state = gaussian, 0, copy.deepcopy(prior.flow.state_dict())
-        for step in range(1, steps + 1):
-            index = torch.randperm(len(seen), generator=generator)[:batch_size]
-            loss = -prior._log_density(seen[index]).mean()
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(prior.flow.parameters(), 1.0)
-            optimiser.step()
-            if step % CHECK_EVERY == 0 or step == steps:
-                value = prior._negative_log_likelihood(unseen)
-                if value < best:
-                    best, best_step = value, step
-                    state = copy.deepcopy(prior.flow.state_dict())
-                elif step - best_step >= patience:
-                    break
-        prior.flow.load_state_dict(state)
+        maximise_likelihood(
+            prior.flow,
+            prior._log_density,
+            draw,
+            optimiser,
+            steps=steps,
+            seed=seed,
+            best=best,
+            unfinished=unfinished,
+        )
         prior.freeze()
         prior.notes |= {
             "held_out": int(np.count_nonzero(held)),
-            "steps": best_step,
+            "steps": best.step,
             "nll_train": prior._negative_log_likelihood(seen),
-            "nll_held_out": best,
+            "nll_held_out": best.value,
             "nll_held_out_gaussian": gaussian,
         }
         return prior

@@ -29,10 +29,10 @@ from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import Backbone
 from dine.models.devices import chosen_device, leased
+from dine.models.state import Interrupted, StopRequest, load_state, one_writer, save_state
 from dine.progress import Progress
 from dine.training.objective import Loss, Objective
 from dine.training.parallel import Alone, Team, run_together
-from dine.training.state import Interrupted, StopRequest, load_state, one_writer, save_state
 
 log = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ from torch.multiprocessing import (
 
 from dine.errors import ConfigError, DineError
 from dine.models.devices import leased
-from dine.training.state import Interrupted, StopRequest
+from dine.models.state import Interrupted, StopRequest
 
 GRACE_SECONDS = 5.0
 """How long the others may take to notice that one process has died, before they are ended."""

@@ -17,11 +17,11 @@ from dine.models.backbones import BACKBONES, Backbone
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.models.devices import chosen_device
 from dine.models.inference import COMPUTE
+from dine.models.state import check_still_wanted
 from dine.provenance import code_digest, run_record
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import history_csv, train
 from dine.training.objective import Objective
-from dine.training.state import check_still_wanted
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 

@@ -40,12 +40,12 @@ from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.evaluation.predictions import FORMAT, Prediction, put_prediction, read_predictions
 from dine.models.checkpoint import load_backbone, save_backbone
+from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior
 from dine.registration.calibration import Calibration, load_calibration
 from dine.registration.many import read_jobs
 from dine.training.stage2 import selected_lambda
 from dine.training.stages import new_backbone
-from dine.training.state import load_state, save_state
 from fuzz import mutations as m
 from fuzz.target import Target
 

@@ -180,7 +180,7 @@ CLASSES = {
 }
 
 
-def test_the_digest_of_a_step_covers_all_that_it_runs(undisturbed, monkeypatch):
+def test_the_digest_of_a_step_covers_all_that_it_runs(undisturbed, monkeypatch, fresh):
     monkeypatch.syspath_prepend(undisturbed.place.folder / "code")
     neutral = {name.partition(".")[2] or "__init__" for name in provenance.NEUTRAL}
     seen = set()
