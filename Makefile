@@ -7,7 +7,7 @@ INPUTS ?= 12000
 SEED ?= 0
 BIN := .venv/bin
 
-.PHONY: run tiny test kill-test fuzz test-oldest check format docs wheel-check slurm-test audit lock
+.PHONY: run tiny test kill-test fuzz test-oldest check format docs wheel-check slurm-test profiles-check audit lock
 
 run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
@@ -49,6 +49,10 @@ wheel-check:
 # The workflow through Slurm, which is installed and started for it: Debian or Ubuntu, and root.
 slurm-test: .venv/installed
 	.ci/slurm
+
+# Profiles of other clusters, by dry runs, and a run with all files in a storage; needs rsync.
+profiles-check: .venv/installed
+	.ci/profiles
 
 # Many damaged files for every reader; failing ones are kept in fuzz-failures/. For a nightly run.
 fuzz: .venv/installed

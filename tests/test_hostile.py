@@ -311,8 +311,13 @@ def test_weights_do_not_choose_what_is_run(tmp_path, name, monkeypatch):
 
 def test_weights_name_classes_of_their_kind_only(tmp_path):
     """Also where a module is ours: it could hold functions with effects."""
-    path = tmp_path / "model.safetensors"
-    for name in ("dine.files:write_text", "dine.priors:PCAPrior", "numpy:save", 3, None):
+    path, owned = tmp_path / "model.safetensors", tmp_path / "owned"
+    effects = {"path": str(owned), "text": "x"}
+    weights(path, backbone="dine.files:write_text", arguments=effects)
+    with pytest.raises(CheckpointError, match=r"'dine\.files:write_text' is no backbone"):
+        load_backbone(path)
+    assert not owned.exists()
+    for name in ("dine.priors:PCAPrior", "numpy:save", 3, None):
         weights(path, backbone=name)
         with pytest.raises(CheckpointError, match=r"model\.safetensors does not say how to build"):
             load_backbone(path)
@@ -341,6 +346,7 @@ def test_weights_with_impossible_arguments(tmp_path, arguments):
     ("kind", "shape"),
     [
         ("pca", {"points": 16, "components": 100_000}),
+        ("pca", {"points": 16, "components": 10_000}),  # which there would be room for
         ("pca", {"points": -1, "components": 3}),
         ("flow", {"points": 16, "transforms": 10**9, "hidden": 4}),
         ("flow", {"points": 16, "transforms": 2, "hidden": 100_000}),
@@ -383,11 +389,21 @@ def test_published_weights_are_not_larger_than_their_file(tmp_path, modern):
     load_backbone(path)
     small = torch.zeros(4321).as_strided((4321,), (1,))
     torch.save({"a": small}, path, _use_new_zipfile_serialization=modern)
-    content = path.read_bytes()
-    number = b"M" + struct.pack("<H", 4321)
-    assert number in content
-    path.write_bytes(content.replace(number, b"J" + struct.pack("<i", 2**30)))
-    with pytest.raises(CheckpointError, match=r"model\.pth"):
+    number, larger = b"M" + struct.pack("<H", 4321), b"J" + struct.pack("<i", 2**30)
+    if modern:
+        with zipfile.ZipFile(path) as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+    else:
+        members = {"": path.read_bytes()}
+    assert any(number in content for content in members.values())
+    members = {name: content.replace(number, larger) for name, content in members.items()}
+    if modern:
+        with zipfile.ZipFile(path, "w") as archive:
+            for name, content in members.items():
+                archive.writestr(name, content)
+    else:
+        path.write_bytes(members[""])
+    with pytest.raises(CheckpointError, match=r"model\.pth .* announces"):
         load_backbone(path)
 
 

@@ -89,8 +89,8 @@ rule pretraining_targets:
 
 rule pretrain:
     input:
-        pairs=expand(rules.pretraining_pairs.output, shape=LEVELS),
-        targets=expand(rules.pretraining_targets.output, shape=LEVELS),
+        pairs=expand(PRETRAINING / "{shape}" / "pairs.h5", shape=LEVELS),
+        targets=expand(PRETRAINING / "{shape}" / "resampled.h5", shape=LEVELS),
     output:
         model=PRETRAINING / "{backbone}" / "model.safetensors",
         history=PRETRAINING / "{backbone}" / "history.csv",
@@ -150,7 +150,7 @@ rule pretraining_fields:
 rule pretraining_prior:
     input:
         expand(
-            rules.pretraining_fields.output,
+            PRETRAINING / "{backbone}" / "fields_{shape}.h5",
             shape=LEVELS,
             allow_missing=True,
         ),
@@ -176,8 +176,8 @@ rule pretraining_prior:
 rule pretraining_calibration:
     input:
         model=rules.pretrain.output.model,
-        pairs=expand(rules.pretraining_pairs.output, shape=LEVELS),
-        targets=expand(rules.pretraining_targets.output, shape=LEVELS),
+        pairs=expand(PRETRAINING / "{shape}" / "pairs.h5", shape=LEVELS),
+        targets=expand(PRETRAINING / "{shape}" / "resampled.h5", shape=LEVELS),
         prior=rules.pretraining_prior.output,
     output:
         calibration=PRETRAINING / "{backbone}" / "calibration.json",
@@ -204,5 +204,9 @@ rule pretraining_calibration:
 
 rule pretrained:
     input:
-        expand(rules.pretrain.output, backbone=CONFIG.backbones),
-        expand(rules.pretraining_calibration.output, backbone=CONFIG.backbones),
+        expand(
+            PRETRAINING / "{backbone}" / "model.safetensors", backbone=CONFIG.backbones
+        ),
+        expand(
+            PRETRAINING / "{backbone}" / "calibration.json", backbone=CONFIG.backbones
+        ),

@@ -66,12 +66,12 @@ rule figures:
     resources:
         **request("reporting"),
     params:
-        results=RESULTS,
         settings=drawn_settings(),
         code=code_digest("figures"),
     shell:
-        "dine --log {log:q} figures --results {params.results:q} --settings {params.settings:q}"
-        ' --out "$(dirname -- {output.figures[0]:q})"'
+        'drawn="$(dirname -- {output.figures[0]:q})";'
+        ' dine --log {log:q} figures --results "$(dirname -- "$drawn")"'
+        ' --settings {params.settings:q} --out "$drawn"'
 
 
 rule resolved_config:
@@ -115,12 +115,11 @@ rule html:
     resources:
         **request("reporting"),
     params:
-        results=RESULTS,
         settings=whole_config(),
         code=code_digest("report"),
     shell:
-        "dine --log {log:q} report --results {params.results:q} --settings {params.settings:q}"
-        " --out {output:q}"
+        'dine --log {log:q} report --results "$(dirname -- {output:q})"'
+        " --settings {params.settings:q} --out {output:q}"
 
 
 # One target for each prior: `prior_pca`, `prior_flow`, … compare it with Stage 1 and the control.
