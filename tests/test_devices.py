@@ -128,6 +128,22 @@ def test_devices_are_told_apart_by_name_not_by_index(two, monkeypatch):
             pass
 
 
+def test_the_name_is_the_gpu_s_own(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(
+        torch.cuda, "get_device_properties", lambda i: SimpleNamespace(uuid=f"id-{7 - i}")
+    )
+    assert devices._names() == ["id-7", "id-6"]
+
+
+def test_one_process_at_a_time_looks_around(two):
+    """Otherwise two of them could each find half of what they need."""
+    with another_process("turn"), pytest.raises(Waited), devices.leased(CUDA):
+        pass
+    with devices.leased(CUDA):
+        pass
+
+
 def test_leases_can_be_switched_off(two, monkeypatch, tmp_path):
     monkeypatch.setenv(devices.LEASES, "off")
     monkeypatch.setattr(devices, "_folder", lambda: pytest.fail("asked for a folder"))

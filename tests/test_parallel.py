@@ -1,8 +1,10 @@
 """Several processes train as one does, and stop together."""
 
+import contextlib
 import os
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -90,7 +92,10 @@ def test_another_number_of_processes_goes_on_from_the_state(alone, tmp_path, bef
     assert [row["step"] for row in history] == list(range(1, 9))
 
 
-ON_A_NODE = "import pathlib, sys, test_parallel; test_parallel.run(pathlib.Path(sys.argv[1]), 2)"
+ON_A_NODE = """
+import pathlib, sys, test_parallel
+test_parallel.run(pathlib.Path(sys.argv[1]), 2, steps=int(sys.argv[2]))
+"""
 
 
 def slurm(monkeypatch, **facts):
@@ -100,19 +105,46 @@ def slurm(monkeypatch, **facts):
         monkeypatch.setenv(f"SLURM_{name}", str(value))
 
 
-def test_two_nodes_train_as_one_process_does(alone, tmp_path, monkeypatch):
+@contextlib.contextmanager
+def two_nodes(folder, monkeypatch, steps):
+    """A training on two nodes, which are both this machine."""
     monkeypatch.setenv("MASTER_ADDR", "127.0.0.1")
     monkeypatch.setenv("MASTER_PORT", str(parallel._free_port()))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(__file__), *sys.path]))
+    command = [sys.executable, "-c", ON_A_NODE, str(folder), str(steps)]
     nodes = []
     for number in range(2):
         slurm(monkeypatch, NODEID=number)
-        nodes.append(subprocess.Popen([sys.executable, "-c", ON_A_NODE, str(tmp_path)]))
-    assert [node.wait(timeout=300) for node in nodes] == [0, 0]
+        nodes.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
+    try:
+        yield nodes
+    finally:
+        for node in nodes:
+            node.kill()
+            node.wait()
+
+
+def test_two_nodes_train_as_one_process_does(alone, tmp_path, monkeypatch):
+    with two_nodes(tmp_path, monkeypatch, steps=8) as nodes:
+        said = [node.communicate(timeout=300)[1] for node in nodes]
+    assert [node.returncode for node in nodes] == [0, 0], said
     state, _ = load_state(tmp_path / loop.STATE, IDENTITY)
     scale = difference(Mover().state_dict(), alone[0])
     assert difference(state["model"], alone[0]) < ROUNDING * scale
     assert [row["step"] for row in state["history"]] == list(range(1, 9))
+
+
+def test_a_node_that_is_asked_to_stop_stops_all(tmp_path, monkeypatch):
+    with two_nodes(tmp_path, monkeypatch, steps=10**6) as nodes:
+        give_up = time.monotonic() + 300
+        while not (tmp_path / "lock.holder").exists() and time.monotonic() < give_up:
+            time.sleep(0.05)
+        nodes[1].terminate()  # not that of the leader
+        said = [node.communicate(timeout=60)[1] for node in nodes]
+    assert [node.returncode for node in nodes] == [1, 1]
+    assert "run the same command again to go on from there" in said[0]
+    state, _ = load_state(tmp_path / loop.STATE, IDENTITY)
+    assert [row["step"] for row in state["history"]] == list(range(1, state["step"] + 1))
 
 
 def test_nodes_as_slurm_tells_them(monkeypatch):

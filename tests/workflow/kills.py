@@ -181,6 +181,7 @@ def finish(place: Workplace, targets: list[str], cores: int) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--kills", type=int, default=66)
+    parser.add_argument("--least", type=int, default=50, help="Some come too late, and count not.")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--record", type=Path, help="CSV with one row for each kill.")
@@ -220,9 +221,11 @@ def main() -> int:
     print(f"{len(done)} kills in {time.monotonic() - began:.0f} s with seed {options.seed}:")
     print(f"  trainings that went on from a saved state: {resumed}, refused folders: {refused}")
     print(f"  files that differ from the undisturbed run: {', '.join(odd) or 'none'}")
-    if not options.keep:
+    if odd:
+        print(f"  both are kept in {root}")
+    elif not options.keep:
         shutil.rmtree(root)
-    return int(bool(odd) or len(done) < options.kills)
+    return int(bool(odd) or len(done) < min(options.kills, options.least))
 
 
 if __name__ == "__main__":

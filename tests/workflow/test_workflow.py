@@ -282,6 +282,22 @@ def test_a_list_of_pairs_is_a_test_set(tmp_path):
     assert planned(folder, made / "pairs.h5", *arguments)["evidence_raw"] == 1
 
 
+@pytest.mark.parametrize("target", ["all", "evidence", "pretrained", "calibrations"])
+def test_a_target_names_what_it_makes_on_its_way(tmp_path, target):
+    """Snakemake makes a deleted file again only where the target itself, or a job to run, asks."""
+    folder = copy_workflow(tmp_path)
+    output = snakemake(folder, target, "-n", "--forceall", "--configfile", TINY).stdout
+    found = r"rule (\w+):\n(?:    input: (.*)\n)?(?:    output: (.*)\n)?"
+    jobs = [
+        (rule, set(inputs.split(", ")), set(outputs.split(", ")))
+        for rule, inputs, outputs in re.findall(found, output)
+    ]
+    assert len(jobs) == sum(planned(folder, target, "--forceall", "--configfile", TINY).values())
+    named = next(inputs for rule, inputs, _ in jobs if rule == target)
+    for rule, _, outputs in jobs:
+        assert rule == target or outputs & named, f"{target} does not name {outputs}"
+
+
 def test_no_examples_are_drawn_where_none_are_asked_for(tmp_path):
     folder = copy_workflow(tmp_path)
     arguments = changed(folder, {"evidence": {"examples": []}})[1:]

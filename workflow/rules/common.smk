@@ -4,6 +4,7 @@ import json
 import shlex
 import shutil
 import sys
+from argparse import Namespace
 from pathlib import Path
 
 from snakemake.exceptions import WorkflowError
@@ -218,22 +219,29 @@ def calibrating_prior(wildcards):
     ]
 
 
-def kept_files():
-    """What `all` makes on its way; named as its inputs so that a deleted file is made again."""
+def priors_from(*names):
+    """Some files of each dataset, and all that lies between them and the priors."""
     found = [FILES.search]
     for dataset in CONFIG.datasets:
-        names = ("raw.json", "pairs.h5", "agreement.json")
         found += [FILES.dataset(dataset, name) for name in names]
-        found += [
-            FILES.variant(dataset, *condition)
-            for condition in conditions(CONFIG, dataset)
-        ]
         for backbone, settings in CONFIG.backbones.items():
             if settings.priors:
                 found.append(FILES.dataset(dataset, f"{backbone}/dvf.h5"))
             found += [
                 FILES.prior(dataset, backbone, prior) for prior in settings.priors
             ]
+    return found
+
+
+def kept_files():
+    """What `all` makes on its way; named as its inputs so that a deleted file is made again."""
+    found = [RESULTS / "config.yaml"]
+    found += priors_from("raw.json", "pairs.h5", "agreement.json")
+    found += [
+        FILES.variant(dataset, *condition)
+        for dataset in CONFIG.datasets
+        for condition in conditions(CONFIG, dataset)
+    ]
     names = ("model.safetensors", "predictions.h5", "metrics.csv")
     return found + [FILES.run(*run, name) for run in RUNS for name in names]
 
@@ -412,6 +420,31 @@ def cell_predictions(cells):
     ]
 
 
+def evidence_kept():
+    """What `evidence` makes on its way; named as its inputs, as those of `all` are."""
+    found = [FILES.prior(*prior) for prior in diagnosed_priors()]
+    for (dataset, backbone, seed), cells in GROUPS.items():
+        place = Namespace(dataset=dataset)
+        found += [evidence_raw_file(place), evidence_pairs_file(place)]
+        found += [*evidence_variants(place), *cell_predictions(cells)]
+        if backbone == NO_BACKBONE:
+            continue
+        trained, folder = CONFIG.networks(dataset), replica(CONFIG, backbone, seed)
+        for cell in cells:
+            method = CONFIG.evidence.methods.get(cell.method)
+            refined = isinstance(method, dine_config.RefinedMethod)
+            network = method.of if refined else cell.method
+            found += cell_predictions([cell._replace(method=network)])
+            found.append(FILES.run(trained, folder, network, "model.safetensors"))
+            prior = method.prior if method else cell.method
+            if prior in CONFIG.priors:
+                found.append(FILES.dataset(trained, f"{folder}/dvf.h5"))
+                found.append(FILES.prior(trained, folder, prior))
+        found.append(FILES.dataset(trained, "raw.json"))
+        found.append(FILES.dataset(trained, "pairs.h5"))
+    return list(dict.fromkeys(found))
+
+
 def cell_options(cells, predictions):
     methods = [cell.method for cell in cells]
     return f"{options('--method', methods)} {options('--predictions', predictions)}"
@@ -464,18 +497,23 @@ def evidence_searches():
     return [FILES.search, *found]
 
 
-def evidence_diagnostics():
-    """Every prior of the evidence, on every dataset, for the backbone of the search."""
+def diagnosed_priors():
+    """Every prior of the evidence on every dataset, for the backbone of the search."""
     used = set(CONFIG.priors_of_stage2)
     for method in CONFIG.evidence.methods.values():
         used |= {getattr(method, "prior", None)} - {None}
     return [
-        FILES.evidence(
-            "diagnostics", dataset, CONFIG.lambda_search.backbone, f"{prior}.json"
-        )
+        (dataset, CONFIG.lambda_search.backbone, prior)
         for dataset in CONFIG.datasets
         for prior in CONFIG.priors
         if prior in used
+    ]
+
+
+def evidence_diagnostics():
+    return [
+        FILES.evidence("diagnostics", dataset, backbone, f"{prior}.json")
+        for dataset, backbone, prior in diagnosed_priors()
     ]
 
 

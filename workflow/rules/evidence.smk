@@ -353,6 +353,7 @@ rule evidence:
         metrics=evidence_metrics(),
         searches=evidence_searches(),
         diagnostics=evidence_diagnostics(),
+        kept=evidence_kept(),
     output:
         report(
             EVIDENCE / "report.html",

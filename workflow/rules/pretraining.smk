@@ -202,11 +202,21 @@ rule pretraining_calibration:
         " --out {output.calibration:q}"
 
 
+# All of it, so that a deleted file is made again.
 rule pretrained:
     input:
         expand(
-            PRETRAINING / "{backbone}" / "model.safetensors", backbone=CONFIG.backbones
+            PRETRAINING / "{shape}" / "{file}",
+            shape=LEVELS,
+            file=["raw.json", "pairs.h5", "resampled.h5"],
         ),
         expand(
-            PRETRAINING / "{backbone}" / "calibration.json", backbone=CONFIG.backbones
+            PRETRAINING / "{backbone}" / "{file}",
+            backbone=CONFIG.backbones,
+            file=["model.safetensors", "prior.safetensors", "calibration.json"],
+        ),
+        expand(
+            PRETRAINING / "{backbone}" / "fields_{shape}.h5",
+            backbone=CONFIG.backbones,
+            shape=LEVELS,
         ),

@@ -50,6 +50,12 @@ rule calibrate:
         " --out {output.calibration:q}"
 
 
+# With what it makes on its way, so that a deleted file is made again.
 rule calibrations:
     input:
-        [FILES.run(*run, "calibration.json") for run in RUNS],
+        [
+            FILES.run(*run, name)
+            for run in RUNS
+            for name in ("model.safetensors", "calibration.json")
+        ],
+        priors_from("raw.json", "pairs.h5", "resampled.h5"),
