@@ -122,3 +122,13 @@ def test_json_round_trip_and_errors(tmp_path):
 def test_digest_ignores_key_order_but_not_values():
     assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
     assert digest({"a": 1}) != digest({"a": 2})
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    done = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append("written"), fsync(handle)))
+    monkeypatch.setattr(os, "replace", lambda *names: (done.append("named"), replace(*names)))
+    write_text(tmp_path / "a.txt", "a")
+    assert done == ["written", "named"]
+    assert (tmp_path / "a.txt").read_text() == "a"
