@@ -414,6 +414,8 @@ def fields(model, pairs, targets, batch_size, compute, name, out):
 def fit_prior(fields, settings, seed, out):
     """Fit a deformation prior to displacement fields and freeze it.
 
+    The fit of a flow saves its state in training/ beside the output, and goes on from there.
+
     Example: dine fit-prior --fields dvf.h5 --settings '{"kind": "pca"}' --out pca.safetensors
     """
     from dine.priors.fitting import fit_prior as run
