@@ -642,9 +642,12 @@ def test_a_nameless_member_of_a_zip(tmp_path):
         fetch(tmp_path / "place", listing("a.zip"), stream.getvalue().replace(b"ab", b"\0b"))
 
 
-def test_a_header_of_a_tar_that_announces_too_much(tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "size"), [(tarfile.GNUTYPE_LONGNAME, 1 << 60), (tarfile.REGTYPE, 1 << 70)]
+)
+def test_a_header_of_a_tar_that_announces_too_much(tmp_path, kind, size):
     info = tarfile.TarInfo("././@LongLink")
-    info.type, info.size = tarfile.GNUTYPE_LONGNAME, 1 << 60
+    info.type, info.size = kind, size
     data = info.tobuf(tarfile.GNU_FORMAT) + bytes(10240)
     with pytest.raises(DownloadError, match="cannot be unpacked"):
         fetch(tmp_path / "place", listing("a.tar"), data)

@@ -436,6 +436,7 @@ _DAMAGE = (
     zlib.error,
     EOFError,
     RuntimeError,
+    OverflowError,  # a place in the file that no number of the system's can name
     ValueError,
 )
 
