@@ -702,7 +702,8 @@ def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
         evidence["test_sets"] = {
             name: entry
             for name, entry in sets.items()
-            if not isinstance(entry, dict) or entry.get("networks") not in gone.get("datasets", ())
+            if not isinstance(entry, dict)
+            or not _is_gone(entry.get("networks"), gone.get("datasets", ()))
         }
     for section in ("backbones", "methods"):
         entries = evidence.get(section)
@@ -726,7 +727,7 @@ def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
         evidence[section] = kept
     if isinstance(evidence.get("examples"), list):
         lost = gone.get("methods", set()) | gone.get("priors", set())
-        evidence["examples"] = [name for name in evidence["examples"] if name not in lost]
+        evidence["examples"] = [x for x in evidence["examples"] if not _is_gone(x, lost)]
 
 
 def _is_gone(name: Any, gone: Collection[str]) -> bool:

@@ -85,6 +85,17 @@ def test_compressed_arrays_may_not_grow_without_end(tmp_path):
         np.testing.assert_array_equal(read_surface(tmp_path / f"b.{suffix}").vertices, POINTS)
 
 
+def test_a_member_of_an_archive_that_is_larger_than_it(tmp_path):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, vertices=POINTS)
+    content = bytearray(path.read_bytes())
+    # What the directory says of the compressed size, which allows a hundred times as much.
+    struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 20, 1 << 31)
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="announces 2147483648 bytes"):
+        read_surface(path)
+
+
 def mat(dimensions, compressed=False, kind=6):
     """A MATLAB file of version 5 with one variable."""
     content = POINTS.T.tobytes()
@@ -497,7 +508,9 @@ def test_taking_entries_away_from_an_evidence_that_holds_lists():
     values = config.read_yaml("config.yaml")
     values["priors"] = {**values["priors"], "pca": None}
     values["evidence"]["methods"] = {"x": {"prior": ["pca"], "priors": [["pca"], {}]}}
-    with pytest.raises(ConfigError):
+    values["evidence"]["examples"] = [["pca"], {}, "lambda0"]
+    values["evidence"]["test_sets"] = {"mine": {"folder": "x", "networks": ["synbench"]}}
+    with pytest.raises(ConfigError, match="examples"):
         config.validate(values)
 
 

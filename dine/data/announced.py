@@ -109,6 +109,7 @@ def member(path: str | os.PathLike, archive: zipfile.ZipFile, name: str) -> byte
         DataError: it grows to more than compressed data can.
     """
     info = archive.getinfo(name)
+    check(path, f"its member {name!r}", info.compress_size, os.path.getsize(path))
     check(path, f"its member {name!r}", info.file_size, limit(info.compress_size))
     return archive.read(info)
 

@@ -430,7 +430,7 @@ def manifest(path: Path) -> None:
     for job in read_jobs(path):
         # Its folder lies directly below that of the results.
         assert (path.parent / job.name).resolve().parent == path.parent.resolve()
-        assert isinstance(job.source.is_file(), bool)
+        assert os.path.isfile(job.source) in (True, False)  # a name can be too long for one
 
 
 SPLIT = {"train": ["12", "Source_13_5_0.3.ply"], "val": [14], "test": ["15"]}
