@@ -218,6 +218,28 @@ def test_hdf5_arrays_that_lie_elsewhere_are_not_read(tmp_path):
         read_surface(path)
 
 
+@pytest.mark.parametrize(("number", "length"), [(0, 0), (0, 8), (1, 2**64 - 16), (1, 2**40)])
+def test_hdf5_texts_that_never_end(tmp_path, number, length):
+    """The library would go round for ever where an object moves it on by nothing."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["vertices"] = POINTS
+        file.attrs["format"] = "dine-fields"
+    content = bytearray(path.read_bytes())
+    place = content.index(b"GCOL") + 16
+    assert struct.unpack_from("<H6xQ", content, place) == (1, len("dine-fields"))
+    np.testing.assert_array_equal(read_surface(path).vertices, POINTS)
+    struct.pack_into("<H6xQ", content, place, number, length)
+    path.write_bytes(content)
+    for read in (read_surface, read_fields, read_pairs):
+        with pytest.raises(DataError, match="damaged"):
+            read(path)
+    # Behind a block of the user's own, as in MATLAB 7.3.
+    path.write_bytes(bytes(512) + content)
+    with pytest.raises(DataError, match="damaged"):
+        read_surface(path)
+
+
 def test_pairs_are_not_larger_than_their_file(tmp_path):
     path = tmp_path / "pairs.h5"
     write_pairs(path, make_pairs(20, 3))

@@ -29,7 +29,7 @@ def opened(path: str | os.PathLike, expected: str) -> Iterator[h5py.File]:
         DataError: missing, damaged, of another format, or lacking what the block reads.
     """
     try:
-        with h5py.File(path) as file:
+        with announced.hdf5(path) as file:
             if str(file.attrs.get("format")) != expected:
                 raise DataError(f"{path} is of another kind than {expected}.")
             yield file

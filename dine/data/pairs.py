@@ -493,7 +493,7 @@ def _opened(
     if not path.is_file():
         raise DataError(f"{path} does not exist.")
     try:
-        with h5py.File(path, "r") as file:
+        with announced.hdf5(path) as file:
             attributes = {
                 name: value.decode() if isinstance(value, bytes) else value.item()
                 for name, value in file.attrs.items()

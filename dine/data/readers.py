@@ -320,13 +320,13 @@ def _read_npz(path: Path) -> _Arrays:
 
 
 def _read_h5(path: Path) -> _Arrays:
-    with h5py.File(path, "r") as file:
+    with announced.hdf5(path) as file:
         return _named(path, file, lambda name: announced.checked(file, name)[()])
 
 
 def _read_mat(path: Path) -> _Arrays:
     if h5py.is_hdf5(path):  # MATLAB 7.3, which stores arrays column by column
-        with h5py.File(path, "r") as file:
+        with announced.hdf5(path) as file:
             arrays = {name: announced.checked(file, name)[()].T for name in _datasets(file)}
     else:
         content = announced.numeric_variables(path, path.read_bytes())

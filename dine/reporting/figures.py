@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,6 +19,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from dine.data import announced
 from dine.errors import DataError
 from dine.files import atomic_path
 from dine.reporting import tables
@@ -164,7 +164,7 @@ def read_group(path: str | os.PathLike, condition: str, field: str) -> tuple[np.
         DataError: the file cannot be read or lacks the condition or the field.
     """
     try:
-        with h5py.File(path) as stream:
+        with announced.hdf5(path) as stream:
             group = stream[condition]
             return group["pair"].asstr()[:], group[field][:]
     except FileNotFoundError as error:
