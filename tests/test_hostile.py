@@ -6,6 +6,7 @@ import json
 import os
 import struct
 import tarfile
+import tracemalloc
 import zipfile
 import zlib
 
@@ -106,6 +107,20 @@ def mat(dimensions, compressed=False, kind=6):
         packed = zlib.compress(element)
         element = struct.pack("<II", 15, len(packed)) + packed
     return b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + element
+
+
+def test_matlab_files_with_more_than_they_announce(tmp_path):
+    """Only that much is unpacked."""
+    path = tmp_path / "a.mat"
+    plain = mat((20, 3))
+    packed = zlib.compress(plain[128:] + bytes(100 * SMALL), 1)
+    path.write_bytes(plain[:128] + struct.pack("<II", 15, len(packed)) + packed)
+    tracemalloc.start()
+    vertices = read_surface(path).vertices
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_array_equal(np.sort(vertices), np.sort(POINTS))
+    assert most < 10 * SMALL
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -237,6 +252,22 @@ def test_hdf5_texts_that_never_end(tmp_path, number, length):
     # Behind a block of the user's own, as in MATLAB 7.3.
     path.write_bytes(bytes(512) + content)
     with pytest.raises(DataError, match="damaged"):
+        read_surface(path)
+
+
+def test_hdf5_chunks_without_room_for_their_checksum(tmp_path):
+    """The library would read far beyond them, and crash."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("vertices", data=POINTS, chunks=POINTS.shape, fletcher32=True)
+    np.testing.assert_array_equal(read_surface(path).vertices, POINTS)
+    content = bytearray(path.read_bytes())
+    # The first key of the tree of chunks begins with the first chunk's size.
+    place = content.index(b"TREE\x01") + 24
+    assert struct.unpack_from("<I", content, place) == (POINTS.nbytes + 4,)
+    struct.pack_into("<I", content, place, 3)
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="a chunk of 'vertices' has 3 bytes"):
         read_surface(path)
 
 
@@ -468,6 +499,7 @@ def test_a_damaged_training_state_is_not_used(tmp_path):
         {"error": [0.1, "x", 0.3]},
         {"likely": [0.1, float("nan"), 0.3]},
         {"likely": None},
+        {"likely": [0.1, 0.2, 10**400]},
         {"reference": {"final": []}},
         {"reference": {"final": [[0.1]]}},
         {"reference": [1]},
@@ -479,6 +511,9 @@ def test_calibrations_that_cannot_be_looked_up(tmp_path, change):
     made = Calibration([0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], {"final": [0.1, 0.2]})
     made.save(path)
     assert load_calibration(path) == made
+    # As whole numbers, which JSON has of any size.
+    path.write_text(path.read_text().replace("0.3", str(10**30)))
+    assert load_calibration(path).expected_error(np.array([1e30])) == 1e30
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(DataError, match=r"calibration\.json is not a calibration"):
         load_calibration(path)

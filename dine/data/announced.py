@@ -122,14 +122,30 @@ def checked(group: h5py.Group, name: str) -> h5py.Dataset:
         raise DataError(
             f"{path}: the array {name!r} lies in another file, which is not read; copy it in."
         )
-    filters = data.id.get_create_plist()
-    packed = any(
-        filters.get_filter(i)[0] not in _NO_COMPRESSION for i in range(filters.get_nfilters())
-    )
+    settings = data.id.get_create_plist()
+    filters = {settings.get_filter(i)[0] for i in range(settings.get_nfilters())}
     size = os.path.getsize(path)
     announced = math.prod(data.shape) * data.dtype.itemsize
+    packed = not filters.issubset(_NO_COMPRESSION)
     check(path, f"the array {name!r}", announced, limit(size) if packed else size)
+    if h5py.h5z.FILTER_FLETCHER32 in filters:
+        _check_chunks(path, name, data)
     return data
+
+
+def _check_chunks(path: str, name: str, data: h5py.Dataset) -> None:
+    """Make sure that every stored chunk has room for its checksum: the library does not look."""
+
+    def look(chunk: h5py.h5d.StoreInfo) -> None:
+        if chunk.size < 4:
+            short.append(chunk.size)
+
+    short: list[int] = []
+    data.id.chunk_iter(look)
+    if short:
+        raise DataError(
+            f"{path} is damaged: a chunk of {name!r} has {short[0]} bytes; make it again."
+        )
 
 
 # --- NumPy ------------------------------------------------------------------------------------
@@ -201,15 +217,15 @@ def numeric_variables(path: str | os.PathLike, content: bytes) -> io.BytesIO:
         start += 8 + size
         if kind == _COMPRESSED:
             unpacker = zlib.decompressobj()
-            allowed = limit(len(content)) - grown
-            element = unpacker.decompress(element, allowed + 1)
-            check(path, "its compressed content", grown + len(element), allowed + grown)
-            grown += len(element)
-            if len(element) < 8:
+            header = unpacker.decompress(element, 8)
+            if len(header) < 8:
                 raise ValueError("a compressed element is cut short")
-            kind, size = struct.unpack_from(f"{order}II", element)
-            check(path, "a compressed element", size, len(element) - 8)
-            element = element[8 : 8 + size]
+            kind, size = struct.unpack(f"{order}II", header)
+            grown += size
+            check(path, "its compressed content", grown, limit(len(content)))
+            # No more than that, however much there is; of 0 bytes zlib would give all.
+            element = unpacker.decompress(unpacker.unconsumed_tail, size) if size else b""
+            check(path, "a compressed element", size, len(element))
         if kind == _MATRIX and _is_whole(element, order):
             kept += struct.pack(f"{order}II", kind, len(element)) + element
     return io.BytesIO(kept)

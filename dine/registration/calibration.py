@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +76,10 @@ def load_calibration(path: Path) -> Calibration:
             raise KeyError("format")
         found = Calibration(**content)
         _check(found)
-    except (KeyError, TypeError, AttributeError, ValueError):
+        lists = {key: [*map(float, getattr(found, key))] for key in ("spread", "error", "likely")}
+        lists["reference"] = {key: [*map(float, found.reference[key])] for key in found.reference}
+        found = replace(found, **lists)
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError):
         raise DataError(
             f"{path} is not a calibration, or is damaged; make one with `dine calibrate`."
         ) from None
