@@ -79,6 +79,11 @@ levels_option = click.option(
     multiple=True,
     help="Deformation level to draw for; repeatable. All of them by default.",
 )
+most_option = click.option(
+    "--most",
+    type=click.IntRange(1),
+    help="At most so many test pairs, spread over levels; of known objects, where there are any.",
+)
 pairs_option = click.option("--pairs", type=IN, required=True, help="Pairs (HDF5).")
 targets_option = click.option(
     "--targets", type=IN, multiple=True, help="Of `resample`, one for each file of pairs."
@@ -248,15 +253,16 @@ def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
 @settings_option(config.Pairs)
 @seed_option
 @click.option("--test-only", is_flag=True, help="All objects for testing, whatever the split.")
+@click.option("--unseen", type=IN, help="raw.json of further objects, for testing only.")
 @click.option("--out", type=OUT, required=True, help="Pairs to write (HDF5).")
-def pairs(raw_file: Path, settings: config.Pairs, seed: int, test_only: bool, out: Path):
+def pairs(raw_file: Path, settings: config.Pairs, seed: int, test_only, unseen, out: Path):
     """Turn raw meshes into index-consistent source/target pairs.
 
     Example: dine pairs --raw mine/raw.json --out pairs.h5
     """
     from dine.data.prepare import prepare_pairs
 
-    prepare_pairs(raw_file, settings, seed=seed, out=out, test_only=test_only)
+    prepare_pairs(raw_file, settings, seed=seed, out=out, test_only=test_only, unseen=unseen)
 
 
 @cli.command()
@@ -264,35 +270,44 @@ def pairs(raw_file: Path, settings: config.Pairs, seed: int, test_only: bool, ou
 @click.option("--condition", type=click.Choice(["noise", "outliers"]), required=True)
 @click.option("--level", type=float, required=True, help="Noise sigma, or outliers in percent.")
 @levels_option
+@most_option
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Variant to write (HDF5).")
-def corrupt(pairs: Path, condition: str, level: float, levels, seed: int, out: Path):
+def corrupt(pairs: Path, condition: str, level: float, levels, most, seed: int, out: Path):
     """Draw corrupted targets for the test split.
 
     Example: dine corrupt --pairs pairs.h5 --condition noise --level 0.03 --out noise.h5
     """
     from dine.data.corruption import make_variant
-    from dine.data.pairs import at_levels, read_pairs, write_variant
+    from dine.data.pairs import evaluated_pairs, read_pairs, write_variant
 
-    test = read_pairs(pairs, split="test")
-    variant = make_variant(at_levels(test, levels), condition, level, seed)
-    write_variant(out, variant, test.checksum)
+    found = read_pairs(pairs)
+    variant = make_variant(evaluated_pairs(found, levels, most), condition, level, seed)
+    write_variant(out, variant, found.checksum)
 
 
 @cli.command()
-@click.option("--raw", "raw_file", type=IN, required=True, help="raw.json of `dine raw`.")
+@click.option(
+    "--raw",
+    "raw_files",
+    type=IN,
+    required=True,
+    multiple=True,
+    help="raw.json of `dine raw`; repeatable.",
+)
 @pairs_option
 @levels_option
+@most_option
 @seed_option
 @click.option("--out", type=OUT, required=True, help="Targets to write (HDF5).")
-def resample(raw_file: Path, pairs: Path, levels, seed: int, out: Path):
+def resample(raw_files, pairs: Path, levels, most, seed: int, out: Path):
     """Draw the points of all targets anew, as two scans of one object never share points.
 
     Example: dine resample --raw mine/raw.json --pairs pairs.h5 --out resampled.h5
     """
     from dine.data.prepare import resample_targets
 
-    resample_targets(raw_file, pairs, seed=seed, out=out, levels=levels)
+    resample_targets(raw_files, pairs, seed=seed, out=out, levels=levels, most=most)
 
 
 @cli.command()
@@ -639,15 +654,21 @@ def diagnose(prior, fields, pairs, dataset, backbone, name, seed, out):
 
 @cli.command()
 @click.argument("metrics", nargs=-1, required=True, type=IN)
+@click.option(
+    "--spread",
+    type=click.FloatRange(0),
+    default=config.Evaluation().training_spread,
+    help="How much differences vary with the training (`evaluation.training_spread`).",
+)
 @click.option("--out", type=FOLDER, required=True, help="Folder for CSV, Markdown and LaTeX.")
-def tables(metrics, out):
+def tables(metrics, spread, out):
     """Aggregate metrics into the paper's tables and their companions.
 
     Example: dine tables a/metrics.csv b/metrics.csv --out tables
     """
     from dine.reporting.tables import all_tables, load_metrics, to_markdown, write_table
 
-    made = all_tables(load_metrics(metrics))
+    made = all_tables(load_metrics(metrics), spread)
     for table in made:
         write_table(table, out / table.name)
     write_text(out / "all.md", "\n\n".join(to_markdown(table) for table in made))

@@ -5,6 +5,7 @@ Importing this module is cheap (no torch), since Snakemake does it for every DAG
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection
 from pathlib import Path
@@ -46,6 +47,12 @@ Count = Annotated[int, BeforeValidator(_no_bool), Field(ge=1)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
 Fraction = Annotated[Number, Field(ge=0, le=1)]
+
+
+def most_pairs_per_level(percents: Collection[float], widths: Collection[float]) -> float:
+    """Different deformations that a recipe's lists give: no end of them where one is a range."""
+    lists = (set(percents), set(widths))
+    return math.inf if max(map(len, lists)) > 1 else 1
 
 
 class Section(BaseModel):
@@ -91,28 +98,33 @@ class Recipe(Section):
     amplitude: Positive = 0.1
     """Standard deviation per coordinate of a control displacement at level 1."""
     pairs_per_level: Count = 1
-    """Targets per object and level."""
+    """Targets per object and level. Their percentages and widths are first those of the two lists,
+    then drawn from the ranges that the lists span."""
 
     @model_validator(mode="after")
     def _combinations(self):
-        combinations = len(self.control_percents) * len(self.widths)
-        if self.pairs_per_level > combinations:
+        most = most_pairs_per_level(self.control_percents, self.widths)
+        if self.pairs_per_level > most:
             raise ValueError(
-                f"`pairs_per_level` is {self.pairs_per_level}, but `control_percents` × `widths` "
-                f"gives only {combinations} different deformations"
+                f"`pairs_per_level` is {self.pairs_per_level}, but `control_percents` and `widths` "
+                f"give only {most:g} different deformations; give one of them two values or more, "
+                "from between which further ones are drawn"
             )
         return self
 
 
 class Split(Section):
-    """Shares of base objects; a published split file takes precedence."""
+    """Shares of objects or deformations; a published split file takes precedence."""
 
+    by: Literal["object", "deformation"] = "object"
+    """What is shared out: whole objects (test pairs are of unseen objects), or the deformations of
+    each object (test pairs are of known objects, under deformations not trained on)."""
     train: Fraction = 0.7
-    """Share of objects to train on."""
+    """Share to train on."""
     val: Fraction = 0.1
-    """Share of objects for the search of λ."""
+    """Share for the search of λ."""
     test: Fraction = 0.2
-    """Share of objects for the tables."""
+    """Share for the tables."""
 
     @model_validator(mode="after")
     def _sum(self):
@@ -133,12 +145,28 @@ class Pairs(Section):
 
 
 class Corruption(Section):
-    """Corrupted targets for the test split; the levels of the paper's Table 3 by default."""
+    """Other targets for the test split; the levels of the paper's Table 3 by default."""
 
     noise: list[Positive] = [0.01, 0.03, 0.04]
     """Standard deviations of Gaussian noise, in the normalised frame."""
     outliers: list[Positive] = [5.0, 25.0, 45.0]
     """Outliers in percent of the points."""
+    resampled: bool = False
+    """Also targets whose points were drawn anew, as two scans share none."""
+    pairs: Count | None = None
+    """At most so many test pairs, evenly spread over levels; of known objects, where there are
+    any. By default all."""
+
+
+class Unseen(Section):
+    """Further objects that all pairs are tested on and none trained."""
+
+    objects: Count = 14
+    """Number of further synthetic objects."""
+    pairs_per_level: Count = 1
+    """Targets per object and level."""
+    folder: str | None = None
+    """For `path` and `doi`: a folder of further objects or pairs, or a list of pairs (CSV)."""
 
 
 class Dataset(Section):
@@ -146,6 +174,23 @@ class Dataset(Section):
     recipe: Recipe = Recipe()
     pairs: Pairs = Pairs()
     corruption: Corruption = Corruption()
+    unseen: Unseen | None = None
+    """Objects that nothing is trained on, for the question of what generalises."""
+
+    @model_validator(mode="after")
+    def _unseen(self):
+        if self.unseen is None:
+            return self
+        if self.source.kind != "synthetic" and self.unseen.folder is None:
+            raise ValueError(
+                f"`unseen.folder` is needed when `source.kind` is {self.source.kind}: a folder of "
+                "objects that are not in the dataset"
+            )
+        if self.source.kind == "synthetic" and self.unseen.folder is not None:
+            raise ValueError(
+                "`unseen.folder` is not used when `source.kind` is synthetic; leave it out"
+            )
+        return self
 
 
 class BackboneConfig(Section):
@@ -157,6 +202,11 @@ class BackboneConfig(Section):
     """Priors whose Stage 2 is trained with this backbone."""
     start: str | None = None
     """In place of `stage1.start`, for this backbone."""
+    datasets: list[str] | None = None
+    """Datasets that it is trained on; by default all."""
+    own_lambda: bool = False
+    """Whether λ is searched with this backbone too, in place of the λ found with that of
+    `lambda_search`."""
 
 
 class PriorConfig(Section):
@@ -279,12 +329,25 @@ class LambdaChoice(Section):
 
     candidates: list[Positive] = Field(default=[1.0e-6, 1.0e-5, 1.0e-4, 1.0e-3], min_length=1)
     """Values of λ to try; λ = 0 is always tried too, for comparison."""
+    extend: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 3
+    """How often the grid may go on where the best value lies at its edge."""
     criterion: Literal["cd", "mce"] = "cd"
     """What the best λ has the lowest mean of: Chamfer distance, or mean correspondence error."""
     steps: Count = 80
     """Stage-2 steps per candidate."""
     validation_pairs: Count = 24
     """Validation pairs on which the candidates are compared."""
+
+    @model_validator(mode="after")
+    def _grid(self):
+        if len(set(self.candidates)) < len(self.candidates):
+            raise ValueError(f"`candidates` holds a value twice: {self.candidates}")
+        if len(self.candidates) == 1 and self.extend:
+            raise ValueError(
+                f"`candidates` holds the single value {self.candidates[0]:g}, which nothing is "
+                "chosen from; give two or more, or set `extend` to 0 to take it as it is"
+            )
+        return self
 
 
 class LambdaSearch(LambdaChoice):
@@ -299,6 +362,10 @@ class LambdaSearch(LambdaChoice):
 class Evaluation(Section):
     batch_size: Count = 4
     """Pairs per forward pass."""
+    training_spread: Fraction = 0.1
+    """How much the difference between two methods varies from one training to another (another
+    seed, or another CPU's rounding): a standard deviation, as a share of the reference's mean.
+    Intervals hold it; docs/results.md says how it was measured."""
 
 
 class Pretraining(Training):
@@ -367,8 +434,6 @@ AnyMethod = Annotated[ClassicalMethod | Stage2Method | RefinedMethod, Field(disc
 
 
 class EvidenceBackbone(BackboneConfig):
-    datasets: list[str] | None = None
-    """Datasets that it is trained on; by default all."""
     seeds: Count | None = None
     """How many of the seeds, from the first on; by default all."""
 
@@ -499,9 +564,24 @@ class Config(Compute):
         for backbone, settings in self.backbones.items():
             for prior in settings.priors:
                 self._known("priors", prior, f"backbones.{backbone}.priors")
+            for dataset in settings.datasets or ():
+                self._known("datasets", dataset, f"backbones.{backbone}.datasets")
+        for name in self.datasets:
+            if name.endswith("_unseen"):
+                raise ValueError(
+                    f"a dataset cannot be called {name!r}; the ending stands for unseen objects"
+                )
         search = self.lambda_search
         self._known("datasets", search.dataset, "lambda_search.dataset")
         self._known("backbones", search.backbone, "lambda_search.backbone")
+        for name, settings in self.backbones.items():
+            trained = settings.datasets or self.datasets
+            searches = settings.own_lambda or name == search.backbone
+            if searches and search.dataset not in trained:
+                raise ValueError(
+                    f"λ is searched with the backbone {name!r} on `lambda_search.dataset`, "
+                    f"{search.dataset!r}, which is not under `backbones.{name}.datasets`"
+                )
         for prior in search.priors:
             self._known("priors", prior, "lambda_search.priors")
         for name, prior in self.priors.items():
@@ -578,6 +658,31 @@ class Config(Compute):
                 f"`evidence.examples` names {unknown[0]!r}, which is no method; expected some of "
                 f"{', '.join(sorted(known))}"
             )
+
+    def backbones_of(self, dataset: str) -> list[str]:
+        """The backbones that are trained on a dataset, those of the evidence apart."""
+        return [
+            name
+            for name, settings in self.backbones.items()
+            if dataset in (settings.datasets or self.datasets)
+        ]
+
+    def searching(self, backbone: str) -> str:
+        """The backbone whose search of λ counts for a backbone."""
+        own = self.every_backbone[backbone].own_lambda
+        return backbone if own else self.lambda_search.backbone
+
+    def searched(self, backbone: str) -> list[str]:
+        """The priors whose λ is searched with a backbone: those that it counts for."""
+        used = {
+            prior
+            for name, settings in self.every_backbone.items()
+            if self.searching(name) == backbone
+            for prior in settings.priors
+        }
+        first, *others = self.lambda_search.priors
+        # The first one's λ is that of all priors that are not listed.
+        return [first, *(prior for prior in others if prior in used)]
 
     @property
     def every_backbone(self) -> dict[str, BackboneConfig]:
@@ -680,7 +785,24 @@ def validate(values: Any, where: str = "the configuration") -> Config:
             gone["methods"] = {name for name, entry in methods.items() if entry is None}
         values = {key: _without_null(key, section) for key, section in values.items()}
         _forget(values.get("evidence"), gone)
+        _forget_backbones(values, gone)
     return validate_section(Config, values, where)
+
+
+def _forget_backbones(values: dict[str, Any], gone: dict[str, set[str]]) -> None:
+    """Take away the backbones whose datasets were all taken away, and these from the others."""
+    backbones, lost = values.get("backbones"), gone.get("datasets")
+    if not isinstance(backbones, dict) or not lost:
+        return
+    kept = {}
+    for name, entry in backbones.items():
+        if isinstance(entry, dict) and isinstance(entry.get("datasets"), list):
+            left = [dataset for dataset in entry["datasets"] if not _is_gone(dataset, lost)]
+            if entry["datasets"] and not left:
+                continue
+            entry = {**entry, "datasets": left}
+        kept[name] = entry
+    values["backbones"] = kept
 
 
 def _without_null(key: str, section: Any) -> Any:

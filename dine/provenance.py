@@ -14,9 +14,12 @@ import hashlib
 import os
 import platform
 import re
+import shlex
+import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -264,6 +267,63 @@ def _listed(manifest: str | os.PathLike) -> Iterator[str]:
                 yield os.path.join(os.path.dirname(manifest), str(row.get(column)))
 
 
+COMMAND = "DINE_COMMAND"
+"""Environment variable in which the workflow passes on the command that a user gave."""
+
+CPU_SETTINGS = (
+    *("ATEN_CPU_CAPABILITY", "DNNL_MAX_CPU_ISA", "MKL_ENABLE_INSTRUCTIONS", "NUMBA_CPU_FEATURES"),
+    *("NUMBA_CPU_NAME", "OMP_NUM_THREADS", "ONEDNN_MAX_CPU_ISA", "OPENBLAS_CORETYPE"),
+)
+"""Environment variables by which numerical libraries compute as on another CPU."""
+
+
 def run_record(settings: dict[str, Any], seed: int, **facts: Any) -> dict[str, Any]:
     """What every run writes beside its result."""
-    return {"settings": settings, "seed": seed, "versions": versions(), **facts}
+    return {"settings": settings, "seed": seed, "versions": versions(), "made": made(), **facts}
+
+
+def made() -> dict[str, str]:
+    """On which CPU, of which commit, when and by which command something is made.
+
+    Results of a training depend on the CPU by rounding, which chaos enlarges.
+    """
+    own = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    settings = {name: os.environ[name] for name in CPU_SETTINGS if name in os.environ}
+    found = {
+        "CPU": f"{_cpu_name()}, {os.cpu_count()} threads",
+        "commit": _commit(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": os.environ.get(COMMAND, own),
+    }
+    if settings:
+        found["CPU settings"] = " ".join(f"{name}={value}" for name, value in settings.items())
+    return found
+
+
+def _cpu_name() -> str:
+    """The processor as the system names it."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # no Linux
+        text = ""
+    name = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return name[1].strip() if name else platform.processor() or platform.machine() or "unknown"
+
+
+@functools.cache
+def _commit() -> str:
+    """The commit of the checkout that this package lies in, if it does."""
+    if not (PACKAGE.parent / ".git").exists():
+        return f"none (installed package, version {__version__})"
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(PACKAGE.parent), *arguments]
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, timeout=30
+        ).stdout.strip()
+
+    try:
+        head = git("rev-parse", "HEAD")
+        return f"{head} with changes" if git("status", "--porcelain", "-uno") else head
+    except (OSError, subprocess.SubprocessError):
+        return "unknown (git cannot be asked)"

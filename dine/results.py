@@ -10,6 +10,20 @@ from dine.config import STAGE1, ClassicalMethod, Config
 
 CLEAN = "deformation"
 
+KNOWN, UNSEEN = "known", "unseen"
+"""Whether a test pair's object is one of those that were trained on."""
+
+
+def unseen_of(dataset: str) -> str:
+    """How test pairs of unseen objects are shown where others are of known ones."""
+    return f"{dataset}_{UNSEEN}"
+
+
+def trained_on(shown: str) -> str:
+    """The inverse of :func:`unseen_of`; other names stay as they are."""
+    return shown.removesuffix(f"_{UNSEEN}")
+
+
 PAPER_TABLES = {("deformedtissue", False): 1, ("synbench", False): 2, ("deformedtissue", True): 3}
 """Number of the paper's table by dataset and whether targets are corrupted."""
 
@@ -46,11 +60,25 @@ class Results:
     def search(self) -> Path:
         return self.root / "lambda" / "lambda.json"
 
+    def search_of(self, backbone: str) -> Path:
+        """The search of λ with a backbone of its own."""
+        return self.root / "lambda" / backbone / "lambda.json"
+
 
 def conditions(config: Config, dataset: str) -> list[tuple[str, float]]:
-    """The corrupted conditions of a dataset."""
+    """The corrupted conditions of a dataset, and that of targets with other points."""
     corruption = config.datasets[dataset].corruption
-    return [("noise", x) for x in corruption.noise] + [("outliers", x) for x in corruption.outliers]
+    found = [("noise", x) for x in corruption.noise] + [
+        ("outliers", x) for x in corruption.outliers
+    ]
+    return found + ([("resampled", 1.0)] if corruption.resampled else [])
+
+
+def strengths(config: Config, dataset: str) -> list[str]:
+    """The conditions of a dataset that come in several strengths, which figures are drawn over."""
+    return [
+        kind for kind in ("noise", "outliers") if getattr(config.datasets[dataset].corruption, kind)
+    ]
 
 
 def runs(config: Config) -> list[tuple[str, str, str]]:
@@ -58,7 +86,7 @@ def runs(config: Config) -> list[tuple[str, str, str]]:
     return [
         (dataset, backbone, method)
         for dataset in config.datasets
-        for backbone in config.backbones
+        for backbone in config.backbones_of(dataset)
         for method in config.methods(backbone)
     ]
 
@@ -147,17 +175,23 @@ def pca_priors(config: Config, backbone: str) -> list[str]:
     return [p for p in config.every_backbone[backbone].priors if config.priors[p].kind == "pca"]
 
 
+def own_searches(config: Config) -> list[str]:
+    """Backbones with which λ is searched besides that of `lambda_search`."""
+    first = config.lambda_search.backbone
+    return [name for name, b in config.backbones.items() if b.own_lambda and name != first]
+
+
 def figure_names(config: Config) -> list[str]:
     """Stems of all figures of a run, in the order of the report."""
     names = []
     for dataset in config.datasets:
-        kinds = [CLEAN, *dict.fromkeys(kind for kind, _ in conditions(config, dataset))]
+        kinds = [CLEAN, *strengths(config, dataset)]
         names += [f"distance_{dataset}_{kind}" for kind in kinds]
-        for backbone in config.backbones:
+        for backbone in config.backbones_of(dataset):
             names += [f"{kind}_{dataset}_{backbone}" for kind in ("qualitative", "histogram")]
-    names.append("lambda")
+    names += ["lambda", *(f"lambda_{name}" for name in own_searches(config))]
     for dataset in config.datasets:
-        for backbone in config.backbones:
+        for backbone in config.backbones_of(dataset):
             for prior in pca_priors(config, backbone):
                 names += [f"{kind}_{dataset}_{backbone}_{prior}" for kind in ("spectrum", "modes")]
             names.append(f"training_{dataset}_{backbone}")
@@ -179,7 +213,11 @@ def table_names(config: Config) -> list[str]:
         names.append(table_name(dataset, corrupted=False))
         if conditions(config, dataset):
             names += [table_name(dataset, corrupted=True), f"observed_{dataset}"]
-        names.append(f"correspondence_{dataset}")
+        shown = [dataset]
+        if config.datasets[dataset].unseen:
+            shown.append(unseen_of(dataset))
+            names.append(table_name(shown[-1], corrupted=False))
+        names += [f"correspondence_{name}" for name in shown]
         if any(backbone.priors for backbone in config.backbones.values()):
-            names.append(f"gains_{dataset}")
+            names += [f"gains_{name}" for name in shown]
     return names

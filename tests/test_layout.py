@@ -348,7 +348,7 @@ def test_split_lists_with_pair_names(make):
     (folder / "splits/valid_split.txt").write_text("9_5_0.3\n")
     (folder / "splits/test.txt").write_text("Target_2_5_0.3\n")
     found = scan(folder)
-    assert found.split == {"1_5_0.3": "train", "9_5_0.3": "val", "2_5_0.3": "test"}
+    assert found.split == {"0.1/1_5_0.3": "train", "9_5_0.3": "val", "2_5_0.3": "test"}
     assert found.split_file == folder / "splits/test.txt"
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from dine.data.manifest import read_manifest
+from dine.data.names import pair_id
 from dine.data.readers import READABLE_SUFFIXES
 from dine.data.surface import Surface
 from dine.errors import DataError
@@ -57,6 +58,11 @@ class PairFiles:
     target: Path
     outliers: Path | None = None
 
+    @property
+    def id(self) -> str:
+        """The name with its level, ``<level>/<name>``: names repeat from level to level."""
+        return pair_id(self.level, self.name)
+
 
 @dataclass
 class Inventory:
@@ -68,7 +74,8 @@ class Inventory:
             ``folder`` without suffix and with ``__`` for ``/``.
         pairs: sorted by condition, corruption, level, object and name.
         left_out: every file or folder that is not used, with the reason, sorted by path.
-        split: train, val or test by object key or pair name; None without a split file.
+        split: train, val or test by object key, pair name or ``PairFiles.id``; None without a split
+            file.
         split_file: where ``split`` was read (the first file, where there is one per part).
     """
 
@@ -78,6 +85,11 @@ class Inventory:
     left_out: list[tuple[Path, str]] = field(default_factory=list)
     split: dict[str, str] | None = None
     split_file: Path | None = None
+
+    @property
+    def clean(self) -> list[PairFiles]:
+        """The pairs whose targets are not corrupted."""
+        return [pair for pair in self.pairs if pair.condition == "deformation"]
 
     @property
     def has_pairs(self) -> bool:
@@ -622,15 +634,21 @@ def _attach_split(inventory: Inventory, files: list[Path]) -> None:
         (path, f"another split file, {first.name}, is used") for path in files if path not in used
     ]
     split = {}
+    files = _files_by_id(inventory)
     for path in used:
         for entry, part in _split_entries(path, inventory.folder):
-            name = _entry_name(entry, inventory.bases)
+            name = _entry_name(entry, inventory.bases, files)
             if split.setdefault(name, part) != part:
-                raise _bad_split(path, f"{name} is in {split[name]} and in {part}")
+                raise _bad_split(
+                    path,
+                    f"{name} is in {split[name]} and in {part} (name pairs of the same name by "
+                    "their level too, as in 0.3/<name> or by a path)",
+                )
     known = {
         *inventory.bases,
         *(p.object for p in inventory.pairs),
         *(p.name for p in inventory.pairs),
+        *(p.id for p in inventory.pairs),
     }
     if known.isdisjoint(split):
         raise _bad_split(first, "it names none of the objects and pairs found")
@@ -685,17 +703,46 @@ def _csv_items(path: Path, text: str) -> list[tuple[Any, Any]]:
     names = next((columns[name] for name in ("name", "object") if name in columns), None)
     if names is None or "split" not in columns:
         raise _bad_split(path, "it has no rows, or no columns 'name' (or 'object') and 'split'")
-    return [(row[names], row[columns["split"]]) for row in rows]
+    level = columns.get("level")
+    return [
+        (
+            f"{row[level]}/{row[names]}" if level and row[level] else row[names],
+            row[columns["split"]],
+        )
+        for row in rows
+    ]
 
 
-def _entry_name(entry: str, bases: dict[str, Path]) -> str:
-    """Object key or pair name that an id, a name, a file name or a path stands for."""
+def _files_by_id(inventory: Inventory) -> dict[tuple[str, ...], str]:
+    """Ids of pairs by the parts of their files' paths, without suffix."""
+    return {
+        path.relative_to(inventory.folder).with_suffix("").parts: pair.id
+        for pair in inventory.pairs
+        for path in (pair.source, pair.target)
+        if path.is_relative_to(inventory.folder)
+    }
+
+
+def _entry_name(entry: str, bases: dict[str, Path], files: dict[tuple[str, ...], str]) -> str:
+    """Object key, pair name or pair id that an id, a name, a file name or a path stands for."""
     *folders, last = [part for part in re.split(r"[/\\]", entry.strip()) if part not in ("", ".")]
     stem, suffix = os.path.splitext(last)
     if suffix.lower() in (*READABLE_SUFFIXES, ".triangle"):
         last = stem
     path_key = "__".join([*folders, last])
-    return path_key if path_key in bases else _ROLE.sub("", last, count=1)
+    if path_key in bases:
+        return path_key
+    name = _ROLE.sub("", last, count=1)
+    if not folders or name in bases:
+        return name
+    # The folder of the dataset itself, and those above it, may stand before the path.
+    tails = [(*folders[start:], last) for start in range(len(folders))]
+    found = next((files[tail] for tail in tails if tail in files), None)
+    if found is not None:
+        return found
+    place = _place(tuple(folders))
+    clean = place.condition == "deformation" and not place.problem
+    return pair_id(next(iter(place.levels), None) if clean else None, name)
 
 
 def _bad_split(path: Path, reason: str) -> DataError:

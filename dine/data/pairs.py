@@ -51,6 +51,7 @@ import scipy
 
 from dine import __version__
 from dine.data import announced
+from dine.data.names import deformation_of
 from dine.data.sampling import SurfaceSamples
 from dine.errors import ConfigError, DataError
 from dine.files import atomic_path, digest
@@ -138,6 +139,22 @@ class PairSet:
 
     def __len__(self) -> int:
         return len(self.source)
+
+    @property
+    def known(self) -> np.ndarray:
+        """(P,) bool: whether some pair of the same object is trained on."""
+        return np.isin(self.object, self.object[self.split == "train"])
+
+    @property
+    def cluster(self) -> np.ndarray:
+        """(P,) str: what intervals draw whole, since it is what pairs of one split share by chance.
+
+        The deformation where the object is known (one may come at several levels), otherwise the
+        object.
+        """
+        both = zip(self.object.tolist(), self.name.tolist(), strict=True)
+        deformations = [f"{name}/{deformation_of(pair)}" for name, pair in both]
+        return np.where(self.known, np.array(deformations, dtype=str), self.object)
 
     @property
     def displacement(self) -> np.ndarray:
@@ -382,6 +399,32 @@ def at_levels(pairs: PairSet, levels: Sequence[float]) -> PairSet:
         asked = ", ".join(f"{level:g}" for level in levels)
         raise DataError(f"There are no pairs of the levels {asked}; there are {found}.")
     return pairs.select(index=rows)
+
+
+def evaluated_pairs(
+    pairs: PairSet, levels: Sequence[float] = (), most: int | None = None
+) -> PairSet:
+    """The test pairs of a whole file, of some levels where these are given, or ``most`` of them.
+
+    These are evenly spread over the levels, and of known objects where there are any.
+
+    Raises:
+        DataError: there are no test pairs, or none of these levels.
+    """
+    some = at_levels(pairs.select(index=pairs.split == "test"), levels)
+    if most is None or len(some) == 0:
+        return some
+    known = np.isin(some.name, pairs.name[pairs.known])
+    if known.any():
+        some = some.select(index=known)
+    # Within a level, names in an order of chance, so that no object comes first.
+    order = np.argsort([digest(["tested", name]) for name in some.name.tolist()], kind="stable")
+    ranks = np.empty(len(some), int)
+    for level in np.unique(some.level):
+        here = order[some.level[order] == level]
+        ranks[here] = np.arange(len(here))
+    first = np.lexsort((some.level, ranks))[:most]
+    return some.select(index=np.sort(first))
 
 
 def keyed_rng(*key: Any) -> np.random.Generator:

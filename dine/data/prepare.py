@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 
 from dine.config import Pairs
 from dine.data.layout import Inventory, PairFiles, check_pair
+from dine.data.names import deformation_of
 from dine.data.obtain import obtained
 from dine.data.pairs import (
     PAIR_DATASETS,
@@ -21,6 +23,7 @@ from dine.data.pairs import (
     PairSet,
     Variant,
     at_levels,
+    evaluated_pairs,
     keyed_rng,
     read_pairs,
     write_pairs,
@@ -42,53 +45,81 @@ _log = logging.getLogger(__name__)
 
 
 def prepare_pairs(
-    raw: Path, settings: Pairs, *, seed: int, out: Path, test_only: bool = False
+    raw: Path,
+    settings: Pairs,
+    *,
+    seed: int,
+    out: Path,
+    test_only: bool = False,
+    unseen: Path | None = None,
 ) -> None:
     """Make all pairs of a dataset and write them; broken pairs are reported and left out.
 
-    With ``test_only`` all objects are for testing, whatever the settings' split.
+    With ``test_only`` all objects are for testing, whatever the settings' split. All pairs of the
+    raw files ``unseen`` are for testing too; their objects must be others.
 
     Raises:
-        DataError: no usable pair, or too few base objects to split.
+        DataError: no usable pair, too few base objects or deformations to split, or an object both
+            in the dataset and among the unseen ones.
     """
-    inventory, origin = obtained(raw)
-    count = sum(files.condition == "deformation" for files in inventory.pairs)
-    split = settings.split.model_dump()
-    if test_only:
-        split = dict.fromkeys(split, 0.0) | {"test": 1.0}
+    found = [obtained(path) for path in (raw, unseen) if path is not None]
+    count = sum(len(inventory.clean) for inventory, _ in found)
+    split = settings.split.model_dump(exclude={"by"})
+    everything = dict.fromkeys(split, 0.0) | {"test": 1.0}
+    sets = []
     with Progress("pairs", count, unit="pair") as bar:
-        pairs, _ = make_pairs(
-            inventory,
-            points=settings.points,
-            convention=settings.convention,
-            split=split,
-            seed=seed,
-            origin=origin,
-            progress=lambda done, total: bar.update(),
+        for number, (inventory, origin) in enumerate(found):
+            pairs, _ = make_pairs(
+                inventory,
+                points=settings.points,
+                convention=settings.convention,
+                split=everything if test_only or number else split,
+                by="object" if test_only or number else settings.split.by,
+                seed=seed,
+                origin=origin,
+                progress=lambda done, total: bar.update(),
+            )
+            sets.append(pairs)
+    both = set(sets[0].object).intersection(*(other.object for other in sets[1:]))
+    if len(sets) > 1 and both:
+        raise DataError(
+            f"{unseen} has objects that are in {raw} too, such as {min(both)!r}; unseen objects "
+            "must be others, so rename or remove them."
         )
+    pairs = PairSet.concatenate(sets)
+    pairs.attributes["checksum"] = pairs.checksum
     write_pairs(out, pairs)
 
 
 def resample_targets(
-    raw: Path, pairs_path: Path, *, seed: int, out: Path, levels: Sequence[float] = ()
+    raws: Sequence[Path],
+    pairs_path: Path,
+    *,
+    seed: int,
+    out: Path,
+    levels: Sequence[float] = (),
+    most: int | None = None,
 ) -> None:
     """Write targets whose points were drawn anew: same surfaces, no point-to-point counterpart.
 
     Two scans of one object never share points. The result is a variant of condition
-    ``resampled`` (level 1) of all pairs in the file, or of those of some deformation levels; draws
-    are keyed by seed and object.
+    ``resampled`` (level 1) of all pairs in the file, or of those of some deformation levels; or,
+    with ``most``, of so many test pairs (:func:`dine.data.pairs.evaluated_pairs`). Draws are keyed
+    by seed and object.
 
     Raises:
         DataError: the pairs were not made from these raw files.
     """
-    inventory, _ = obtained(raw)
+    files = {pair.id: pair for path in raws for pair in obtained(path)[0].clean}
     pairs = read_pairs(pairs_path)
     checksum = pairs.checksum
-    pairs = at_levels(pairs, levels)
-    files = {_pair_name(pair): pair for pair in inventory.pairs if pair.condition == "deformation"}
+    pairs = at_levels(pairs, levels) if most is None else evaluated_pairs(pairs, levels, most)
     missing = [name for name in pairs.name.tolist() if name not in files]
     if missing:
-        raise DataError(f"{pairs_path} was not made from {raw}, which lacks {missing[0]!r}.")
+        raise DataError(
+            f"{pairs_path} was not made from {' and '.join(map(str, raws))}, "
+            f"which lacks {missing[0]!r}."
+        )
     targets = np.empty_like(pairs.target)
     with Progress("resampled targets", len(pairs), unit="pair") as bar:
         for row, name in enumerate(pairs.name.tolist()):
@@ -117,23 +148,28 @@ def make_pairs(
     points: int,
     convention: str,
     split: Mapping[str, float],
+    by: str = "object",
     seed: int,
     origin: str = "files",
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[PairSet, list[tuple[str, str]]]:
-    """Sample the pairs of condition ``deformation`` and split them by base object.
+    """Sample the pairs of condition ``deformation`` and split them.
 
     Points are drawn on the source and carried to the target. The draw is keyed by seed and object,
     and the convention is computed once for each distinct undeformed surface, so that all targets of
     an object share points and order.
 
     Without a published split, objects are shuffled by ``seed`` and shared out by fraction, at least
-    one to each split whose fraction is not zero. A published split (``inventory.split``) is kept as
-    it is: by pair name where it has that, otherwise by object; objects in two of its parts are
-    logged and kept. Where it has no ``val``, some of its training objects become ``val``.
+    one to each split whose fraction is not zero; or, ``by`` deformation, the pairs of each object
+    are, as evenly over levels as can be. Pairs of one object and name stay together there, since
+    they may be one deformation at several levels. A published split (``inventory.split``) is kept
+    as it is: by pair id or name where it has that, otherwise by object; objects in two of its parts
+    are logged and kept. Where it has no ``val``, some of its training objects become ``val``, or,
+    where all of these are tested on as well, some of their deformations.
 
     Attributes of the result: ``seed``, ``convention``, ``points``, ``origin``, ``split_rule``
-    (``objects`` or ``published``), ``split_train``, ``split_val``, ``split_test`` (the fractions),
+    (``objects``, ``deformations`` or ``published``), ``split_train``, ``split_val``,
+    ``split_test`` (the fractions),
     ``split_leakage`` (objects in two parts of a published split, separated by commas),
     ``split_unknown`` (number of names in a published split that fit nothing), ``checksum``.
 
@@ -141,7 +177,8 @@ def make_pairs(
         inventory: what ``dine.data.layout.scan`` found.
         points: N, points per cloud.
         convention: see ``dine.data.sampling.convention_order``.
-        split: fractions of objects for ``train``, ``val`` and ``test``; they sum to 1.
+        split: fractions for ``train``, ``val`` and ``test``; they sum to 1.
+        by: what these are fractions of, ``object`` or ``deformation``.
         seed: >= 0.
         origin: where the data come from, such as ``"synthetic"``.
         progress: called with the numbers of pairs done and of all pairs.
@@ -151,18 +188,16 @@ def make_pairs(
 
     Raises:
         ConfigError: unusable fractions, number of points or convention.
-        DataError: no usable pair, or too few objects for the splits.
+        DataError: no usable pair, or too few objects or deformations for the splits.
     """
     if points < 1:
         raise ConfigError(f"The number of points must be at least 1, found {points}.")
     fractions = _checked_fractions(split)
     rows, skipped = _sample_all(inventory, _Sampler(points, convention, seed), progress)
     if inventory.split is None:
-        objects = {row["object"] for row in rows}
         # Without any row, the reasons for that say more than the number of objects.
-        by_object = _split_objects(objects, fractions, seed) if rows else {}
-        parts = [by_object[row["object"]] for row in rows]
-        facts = {"split_rule": "objects", "split_leakage": "", "split_unknown": 0}
+        parts = _share_out(rows, fractions, by, seed) if rows else []
+        facts = {"split_rule": f"{by}s", "split_leakage": "", "split_unknown": 0}
     else:
         parts, facts = _published_split(rows, inventory.split, fractions, seed)
     kept = []
@@ -202,18 +237,14 @@ def make_pairs(
 _Row = dict[str, Any]
 
 
-def _pair_name(files: PairFiles) -> str:
-    return files.name if files.level is None else f"{files.level:g}/{files.name}"
-
-
 def _sample_all(
     inventory: Inventory, sampler: _Sampler, progress: Callable[[int, int], None] | None
 ) -> tuple[list[_Row], list[tuple[str, str]]]:
     """All columns but the split, row by row, and the pairs that have none, with reasons."""
-    every = [files for files in inventory.pairs if files.condition == "deformation"]
+    every = inventory.clean
     rows, skipped, names = [], [], set()
     for done, files in enumerate(every, start=1):
-        name = _pair_name(files)
+        name = files.id
         try:
             if name in names:
                 raise DataError(f"{files.target}: another pair is called {name} too; rename one.")
@@ -314,6 +345,65 @@ def _checked_fractions(split: Mapping[str, float]) -> dict[str, float]:
     return fractions
 
 
+def _share_out(rows: list[_Row], fractions: Mapping[str, float], by: str, seed: int) -> list[str]:
+    """The part of each row."""
+    if by == "deformation":
+        return _split_deformations(rows, fractions, seed)
+    by_object = _split_objects({row["object"] for row in rows}, fractions, seed)
+    return [by_object[row["object"]] for row in rows]
+
+
+def _split_deformations(rows: list[_Row], fractions: Mapping[str, float], seed: int) -> list[str]:
+    """The part of each row, so that every object is in every part that is not to be empty.
+
+    Rows of one object and name go together.
+    """
+    wanted = {part: fraction for part, fraction in fractions.items() if fraction > 0}
+    objects: dict[str, dict[str, list[int]]] = {}
+    for index, row in enumerate(rows):
+        deformations = objects.setdefault(row["object"], {})
+        deformations.setdefault(deformation_of(row["name"]), []).append(index)
+    parts = [""] * len(rows)
+    for name, deformations in objects.items():
+        if len(deformations) < len(wanted):
+            raise DataError(
+                f"Splitting by deformation into {', '.join(wanted)} needs at least {len(wanted)} "
+                f"deformations of every object, found {len(deformations)} of {name!r}; provide "
+                "more, leave the object out, or split by object."
+            )
+        order = sorted(deformations, key=lambda group: digest([seed, "split", group]))
+        levels = [[rows[index]["level"] for index in deformations[group]] for group in order]
+        for group, part in zip(order, _share_levels(levels, wanted), strict=True):
+            for index in deformations[group]:
+                parts[index] = part
+    return parts
+
+
+def _share_levels(groups: list[list[float]], wanted: Mapping[str, float]) -> list[str]:
+    """The part of each group of one object's pairs, whose levels are given, in their order.
+
+    A group goes to the part that is farthest below its share of the pairs of these levels, and of
+    those of the object; the last ones go where nothing is yet.
+    """
+    total = Counter(level for levels in groups for level in levels)
+    counts: dict[str, Counter[float]] = {part: Counter() for part in wanted}
+    parts = []
+    for number, levels in enumerate(groups):
+        empty = [part for part in wanted if not counts[part]]
+        open_parts = empty if len(groups) - number <= len(empty) else list(wanted)
+        lacking = {
+            part: (
+                sum(wanted[part] * total[level] - counts[part][level] for level in levels),
+                wanted[part] * total.total() - counts[part].total(),
+            )
+            for part in open_parts
+        }
+        part = max(open_parts, key=lacking.__getitem__)
+        counts[part].update(levels)
+        parts.append(part)
+    return parts
+
+
 def _split_objects(objects: set[str], fractions: Mapping[str, float], seed: int) -> dict[str, str]:
     """Share objects out by fraction, with at least one to each part that is not to be empty."""
     wanted = {part: fraction for part, fraction in fractions.items() if fraction > 0}
@@ -341,7 +431,7 @@ def _published_split(
 ) -> tuple[list[str | None], dict[str, str | int]]:
     """Part of each row, None where the split does not name it, and attributes about the split."""
     # The level is part of an id, but a published split may name files without their folders.
-    candidates = [(row["name"], row["name"].split("/", 1)[1], row["object"]) for row in rows]
+    candidates = [(row["name"], deformation_of(row["name"]), row["object"]) for row in rows]
     parts = [
         next((published[name] for name in names if name in published), None) for names in candidates
     ]
@@ -368,16 +458,24 @@ def _published_split(
     training = {name for name, where in homes.items() if "train" in where}
     if training and fractions["val"] > 0 and "val" not in parts:
         # An object that is tested on as well would leak into the choice of λ.
-        training = training - set(leaking) or training
-        shares = {part: fractions[part] for part in ("train", "val")}
-        total = sum(shares.values())
-        carved = _split_objects(
-            training, {part: share / total for part, share in shares.items()}, seed
-        )
-        parts = [
-            carved.get(name, part) if part == "train" else part
-            for name, part in zip(objects, parts, strict=True)
+        apart = training - set(leaking)
+        total = fractions["train"] + fractions["val"]
+        shares = {part: fractions[part] / total for part in ("train", "val")}
+        carved = [
+            index
+            for index, part in enumerate(parts)
+            if part == "train" and objects[index] in (apart or training)
         ]
+        by = "object"
+        if not apart:
+            # Where all are known, what is not are deformations of those that have several.
+            names = {(objects[index], deformation_of(rows[index]["name"])) for index in carved}
+            count = Counter(name for name, _ in names)
+            several = [index for index in carved if count[objects[index]] >= len(shares)]
+            by, carved = ("deformation", several) if several else (by, carved)
+        found = _share_out([rows[index] for index in carved], shares, by, seed)
+        for index, part in zip(carved, found, strict=True):
+            parts[index] = part
     return parts, {
         "split_rule": "published",
         "split_leakage": ", ".join(leaking),

@@ -28,6 +28,7 @@ import numpy as np
 from filelock import FileLock
 
 from dine import __version__
+from dine.config import most_pairs_per_level
 from dine.data.deformation import check_recipe, rbf_displacement
 from dine.data.layout import Inventory
 from dine.data.readers import read_surface, write_surface
@@ -44,6 +45,7 @@ SYNTHETIC = "synthetic"
 
 _MAKER = "dine.data.raw"
 _GENERATORS = {"primitives": primitive, "tissue": tissue_patch}
+_VAIN_DRAWS = 1000
 _Named = tuple[str, Callable[[], Surface]]
 
 
@@ -62,10 +64,10 @@ def write_dataset(
 ) -> None:
     """Deform every object at every level and write the folder described at the top.
 
-    Every object gets ``pairs_per_level`` targets per level, each with its own (a, b) drawn without
-    repetition from ``control_percents`` x ``widths``. The random numbers of a pair follow from
-    (seed, object, level, number of the pair) alone: adding objects, levels or pairs changes no
-    other file.
+    Every object gets ``pairs_per_level`` targets per level, each with its own (a, b): first those
+    of ``control_percents`` x ``widths`` in random order, then numbers drawn evenly from the ranges
+    that the two lists span. The random numbers of a pair follow from (seed, object, level, number
+    of the pair) alone: adding objects, levels or pairs changes no other file.
 
     The folder appears under its name only when it is complete. One that is there already is kept
     as it is if it was made from equal input, and otherwise replaced once the new one is complete.
@@ -255,11 +257,11 @@ def _check(parameters: dict[str, Any]) -> None:
         )
     if min(parameters["levels"]) == 0:
         raise ValueError("levels must be above 0: a target at level 0 is its source.")
-    most = len(parameters["control_percents"]) * len(parameters["widths"])
+    most = most_pairs_per_level(parameters["control_percents"], parameters["widths"])
     if not 1 <= parameters["pairs_per_level"] <= most:
         raise ValueError(
-            f"pairs_per_level must be 1 to {most}, the number of combinations of control_percents "
-            f"and widths, not {parameters['pairs_per_level']}."
+            f"pairs_per_level must be 1 to {most:g}, the number of different deformations that "
+            f"control_percents and widths give, not {parameters['pairs_per_level']}."
         )
 
 
@@ -332,11 +334,9 @@ def _targets(
 ) -> Iterator[tuple[tuple[str, str], Surface]]:
     """((level, <object>_<a>_<b>), deformed surface) of all pairs of one object."""
     seed = parameters["seed"]
-    grid = list(itertools.product(parameters["control_percents"], parameters["widths"]))
     for level in parameters["levels"]:
-        drawn = _rng(seed, name, _text(level)).permutation(len(grid))
-        for k, choice in enumerate(drawn[: parameters["pairs_per_level"]]):
-            control_percent, width = grid[choice]
+        kernels = _kernels(parameters, seed, name, _text(level))
+        for k, (control_percent, width) in enumerate(kernels):
             field = rbf_displacement(
                 surface,
                 level=level,
@@ -349,6 +349,33 @@ def _targets(
             pair = f"{name}_{_text(control_percent)}_{_text(width)}"
             moved = Surface(surface.vertices + field, surface.faces, name=f"target {pair}")
             yield (_text(level), pair), moved
+
+
+def _kernels(parameters: dict[str, Any], *key: int | str) -> list[tuple[float, float]]:
+    """(a, b) of all pairs of one object and level: no two would be written alike."""
+    percents, widths = parameters["control_percents"], parameters["widths"]
+    grid = list(itertools.product(percents, widths))
+    rng = _rng(*key)
+    kernels = [grid[choice] for choice in rng.permutation(len(grid))]
+    written, vain = set(kernels), 0
+    while len(kernels) < parameters["pairs_per_level"]:
+        drawn = tuple(_rounded(rng.uniform(min(some), max(some))) for some in (percents, widths))
+        vain = vain + 1 if drawn in written else 0
+        if vain > _VAIN_DRAWS:
+            raise ValueError(
+                f"pairs_per_level is {parameters['pairs_per_level']}, but control_percents and "
+                f"widths lie so close together that only {len(kernels)} different deformations "
+                "were found; widen one of the two."
+            )
+        if not vain:
+            written.add(drawn)
+            kernels.append(drawn)
+    return kernels[: parameters["pairs_per_level"]]
+
+
+def _rounded(number: float) -> float:
+    """As file names give it, so that a name says exactly what was done."""
+    return float(f"{number:.4g}")
 
 
 def _rng(*key: int | str) -> np.random.Generator:

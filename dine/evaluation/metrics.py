@@ -25,7 +25,7 @@ from dine.evaluation.quality import (
     roughness,
 )
 from dine.files import atomic_path
-from dine.results import CLEAN, condition_key
+from dine.results import CLEAN, KNOWN, UNSEEN, condition_key
 
 POINT_ERRORS_FORMAT = "dine-point-errors"
 
@@ -93,7 +93,10 @@ def evaluate(
     """
     if point_errors is not None and len(predictions) > 1:
         raise ConfigError("Per-point errors are written for one method at a time.")
-    pairs = read_pairs(pairs_path, split="test")
+    everything = read_pairs(pairs_path)
+    test = everything.split == "test"
+    known_object, cluster = everything.known[test], everything.cluster[test]
+    pairs = everything.select(index=test)
     position = {name: i for i, name in enumerate(pairs.name)}
     observed = {}
     for variant_path in variants:
@@ -141,6 +144,8 @@ def evaluate(
                     "origin": origin,
                     "pair": name,
                     "object": pairs.object[index],
+                    "objects": KNOWN if known_object[index] else UNSEEN,
+                    "cluster": cluster[index],
                     "level": float(pairs.level[index]),
                     "condition": prediction.condition,
                     "corruption": prediction.corruption,

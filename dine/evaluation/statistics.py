@@ -25,7 +25,7 @@ SUMMARISED = (
 """Metrics of ``summary``, which adds the failure rate."""
 
 _GROUP = ["dataset", "backbone", "condition", "corruption"]
-_PAIR = ["pair", "object", "level"]
+_PAIR = ["pair", "object", "cluster", "level"]
 _NEEDED = ["dataset", "backbone", "method", "seed", *_PAIR, "condition", "corruption"]
 # Levels and corruptions that passed through float32 must still meet; real ones lie far apart.
 _DECIMALS = 6
@@ -298,8 +298,8 @@ def compare(
     One row per dataset, backbone, condition, corruption, deformation level and value, and one of
     all levels together, whose ``level`` is NaN. Columns beside these:
 
-    - ``method``, ``reference``: the names; ``pairs``, ``objects``: how many; ``seeds_method``,
-      ``seeds_reference``: how many trainings were averaged;
+    - ``method``, ``reference``: the names; ``pairs``, ``objects``, ``clusters``: how many;
+      ``seeds_method``, ``seeds_reference``: how many trainings were averaged;
     - ``mean_method``, ``mean_reference``, ``difference`` (method − reference, in the unit of the
       value) and ``relative`` (difference in percent of the reference);
     - ``ci_low``, ``ci_high``: 95 % interval of the difference, see ``cluster_bootstrap``;
@@ -371,6 +371,56 @@ def compare(
     )
 
 
+def verdicts(
+    metrics: pd.DataFrame, reference: str, value: str = "cd", *, spread: float = 0.0
+) -> pd.DataFrame:
+    """Every method against a reference: by how much it differs, and whether that is decided.
+
+    One row per dataset, backbone, method, condition, corruption and deformation level, and of all
+    levels together, whose ``level`` is NaN; columns beside these: ``pairs``, ``clusters``,
+    ``mean_method``, ``mean_reference``, and, in percent of the reference's mean, ``relative`` and
+    its 95 % interval ``low`` to ``high``. ``verdict`` is ``lower`` or ``higher`` where that holds
+    no zero, otherwise ``undecided``.
+
+    The interval joins two sources of chance as independent: that of the pairs
+    (:func:`cluster_bootstrap`), and that of the training, as another seed or the rounding of
+    another CPU gives another network from the same data: ± 1.96 ``spread`` / √(number of seeds).
+
+    Args:
+        metrics: rows of ``metrics.csv``.
+        reference: the method that the others are compared with, where it was evaluated too.
+        value: column to compare.
+        spread: standard deviation, over trainings, of a difference between two methods' means, as
+            a share of the reference's mean.
+
+    Raises:
+        DataError: see :func:`paired`.
+    """
+    found = []
+    for _, rows in metrics.groupby(["dataset", "backbone"], sort=False):
+        methods = [name for name in rows["method"].unique() if name != reference]
+        if len(methods) == len(rows["method"].unique()):
+            continue
+        for method in methods:
+            some = rows[rows["method"].isin([method, reference])]
+            keys = ["condition", "corruption", "pair"]
+            count = some.groupby(keys)["method"].transform("nunique")
+            if (count == 2).any():
+                found.append(compare(some[count == 2], method, reference, values=(value,)))
+    columns = [*_GROUP, "level", "method", "pairs", "clusters", "mean_method", "mean_reference"]
+    if not found:
+        return pd.DataFrame(columns=[*columns, "relative", "low", "high", "verdict"])
+    table = pd.concat(found, ignore_index=True)
+    percent = 100 / table["mean_reference"].where(table["mean_reference"] > 0)
+    chance = 1.96 * 100 * spread / np.sqrt(table[["seeds_method", "seeds_reference"]].min(axis=1))
+    low, high = (
+        table["relative"] + sign * np.hypot((table[end] - table["difference"]) * percent, chance)
+        for sign, end in ((-1, "ci_low"), (1, "ci_high"))
+    )
+    verdict = np.select([high < 0, low > 0], ["lower", "higher"], "undecided")
+    return table[[*columns, "relative"]].assign(low=low, high=high, verdict=verdict)
+
+
 def _levels(rows: pd.DataFrame) -> Iterable[tuple[float, pd.DataFrame]]:
     """Each deformation level with its rows, and NaN with all; pairs may be of no known level."""
     yield from rows.groupby("level")
@@ -386,10 +436,12 @@ def _difference(rows: pd.DataFrame, samples: int, seed: int) -> dict[str, float]
     """The columns of ``compare`` that follow from the aligned values of some pairs."""
     ours, theirs = rows["method"].mean(), rows["reference"].mean()
     difference = rows["difference"].to_numpy()
-    low, high = cluster_bootstrap(difference, rows["object"].to_numpy(), samples=samples, seed=seed)
+    clusters = rows["cluster"].to_numpy()
+    low, high = cluster_bootstrap(difference, clusters, samples=samples, seed=seed)
     return {
         "pairs": len(rows),
         "objects": rows["object"].nunique(),
+        "clusters": len(np.unique(clusters)),
         "mean_method": ours,
         "mean_reference": theirs,
         "difference": difference.mean(),

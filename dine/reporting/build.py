@@ -15,7 +15,7 @@ from dine.files import read_json
 from dine.priors import PCAPrior, load_prior
 from dine.reporting import figures as draw
 from dine.reporting.tables import display_name, load_metrics, origin_of
-from dine.results import CLEAN, Results, conditions, figure_names, pca_priors, runs
+from dine.results import CLEAN, Results, figure_names, own_searches, pca_priors, runs, strengths
 
 HISTORY_WINDOW = 20
 """Steps over which training curves are averaged, since a step sees few pairs."""
@@ -97,10 +97,13 @@ class Run:
             self.origin(dataset),
         )
 
-    def search(self) -> Figure:
-        return draw.lambda_figure(
-            read_json(self.files.search), self.origin(self.config.lambda_search.dataset)
-        )
+    def searches(self) -> dict[str, Path]:
+        """The files of all searches of λ, by the figures drawn of them."""
+        own = {f"lambda_{name}": self.files.search_of(name) for name in own_searches(self.config)}
+        return {"lambda": self.files.search, **own}
+
+    def search(self, path: Path) -> Figure:
+        return draw.lambda_figure(read_json(path), self.origin(self.config.lambda_search.dataset))
 
     def _pca(self, dataset: str, backbone: str, name: str) -> PCAPrior:
         return load_prior(self.files.prior(dataset, backbone, name))
@@ -114,14 +117,13 @@ class Run:
         found: dict[str, tuple[str, str, Callable[[], Figure]]] = {}
         for dataset in self.config.datasets:
             shown = display_name(dataset)
-            kinds = [CLEAN, *dict.fromkeys(k for k, _ in conditions(self.config, dataset))]
-            for kind in kinds:
+            for kind in (CLEAN, *strengths(self.config, dataset)):
                 found[f"distance_{dataset}_{kind}"] = (
                     f"Accuracy on {shown}",
                     f"Mean Chamfer distance on {shown}.",
                     lambda d=dataset, k=kind: self.distance(d, k),
                 )
-            for backbone in self.config.backbones:
+            for backbone in self.config.backbones_of(dataset):
                 key = f"{dataset}_{backbone}"
                 here = f"{shown}, {display_name(backbone)}"
                 found[f"qualitative_{key}"] = (
@@ -150,7 +152,9 @@ class Run:
                     f"{here}: training curves.",
                     lambda d=dataset, b=backbone: self.training(d, b),
                 )
-        found["lambda"] = ("Choice of λ", "Validation errors over λ.", self.search)
+        for name, path in self.searches().items():
+            caption = f"Validation errors over λ, {display_name(read_json(path)['backbone'])}."
+            found[name] = ("Choice of λ", caption, lambda p=path: self.search(p))
         return {name: found[name] for name in figure_names(self.config)}
 
 

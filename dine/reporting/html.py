@@ -17,10 +17,9 @@ import yaml
 from dine.errors import DataError
 from dine.files import write_text
 from dine.reporting import tables
+from dine.reporting.effects import headlines, overview
 from dine.reporting.tables import Table, display_name
 
-# What a prior is compared with, by column of ``gains``.
-_RIVALS = {"gain_over_lambda0": "the control", "gain_over_stage1": "Stage 1"}
 _PIXELS_PER_DOT = 96 / 150
 
 
@@ -45,6 +44,8 @@ def write_report(
     versions: Mapping[str, str] | None = None,
     step_seconds: Mapping[str, float] | None = None,
     files: Mapping[str, str] | None = None,
+    made: Mapping[str, str] | None = None,
+    spread: float = 0.0,
 ) -> Path:
     """Write the report of a run.
 
@@ -60,6 +61,8 @@ def write_report(
         versions: version by package.
         step_seconds: wall-clock seconds by step.
         files: address relative to the report by label.
+        made: where, when and how the run was made, by label.
+        spread: how much differences vary with the training; see ``statistics.verdicts``.
 
     Raises:
         DataError: a figure is missing, or a file address is not relative.
@@ -75,8 +78,10 @@ def write_report(
         path,
         "report.html",
         origins=origins(metrics),
-        findings=findings(metrics),
-        overview=_overview(metrics),
+        headlines=headlines(metrics, spread=spread),
+        overview=overview(metrics, spread=spread),
+        spread=f"{100 * spread:g}" if spread else "",
+        made=made or {},
         tables=[shown_table(table) for table in report_tables],
         sections=_sections(figures),
         agreement=None if index_agreement is None else _text_frame(index_agreement),
@@ -86,70 +91,6 @@ def write_report(
         seconds={name: _duration(value) for name, value in (step_seconds or {}).items()},
         files=files or {},
     )
-
-
-# ------------------------------------------------------------------------------- findings
-
-
-def findings(metrics: pd.DataFrame) -> list[str]:
-    """What the numbers say, in sentences: per dataset and prior, over all settings."""
-    data = tables.gains(metrics)
-    sentences = []
-    for (dataset, method), rows in data.groupby(["dataset", "method"], sort=False):
-        origin = tables.ORIGIN_NAMES[tables.origin_of(dataset, metrics)]
-        backbones = " and ".join(display_name(name) for name in rows["backbone"].unique())
-        where = f"{display_name(dataset)} ({origin}), {backbones}"
-        name = display_name(method)
-        for column, rival in _RIVALS.items():
-            parts = [
-                _count_better(part[column].dropna(), settings)
-                for settings, part in _by_kind(rows)
-                if part[column].notna().any()
-            ]
-            if parts:
-                sentences.append(
-                    f"{where}: {name} has a lower mean CD than {rival} at {' and '.join(parts)}."
-                )
-            else:
-                sentences.append(
-                    f"{where}: {rival} was not evaluated on the same pairs, so {name} cannot be "
-                    "compared with it."
-                )
-    if not sentences:
-        sentences.append("No prior was evaluated in this run, so there is nothing to compare.")
-    return sentences
-
-
-def _by_kind(rows: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
-    clean = rows["condition"] == "deformation"
-    kinds = [("deformation levels", rows[clean]), ("noise and outlier settings", rows[~clean])]
-    return [(name, part) for name, part in kinds if len(part)]
-
-
-def _count_better(gain: pd.Series, settings: str) -> str:
-    median = float(np.median(gain))
-    change = f"{abs(median):.1f} % {'lower' if median >= 0 else 'higher'}"
-    return f"{int((gain > 0).sum())} of {len(gain)} {settings} (median: {change})"
-
-
-def _overview(metrics: pd.DataFrame) -> list[list[str]]:
-    """The findings by backbone: settings won, then median and range of the reductions."""
-    rows = []
-    data = tables.gains(metrics)
-    for key, group in data.groupby(["dataset", "backbone", "method"], sort=False):
-        for settings, part in _by_kind(group):
-            cells = [*map(display_name, key), settings.capitalize()]
-            for column in (*_RIVALS, "lambda0_gain_over_stage1"):
-                gain = part[column].dropna()
-                cells.append(_spread(gain) if len(gain) else "–")
-            rows.append(cells)
-    return rows
-
-
-def _spread(gain: pd.Series) -> str:
-    low, middle, high = (f"{value:.1f}" for value in np.percentile(gain, (0, 50, 100)))
-    won = f"{(gain > 0).sum()} of {len(gain)}"
-    return f"{won}: {middle} % ({low} to {high})".replace("-", "−")
 
 
 # ------------------------------------------------------------------------------ rendering

@@ -22,9 +22,10 @@ def build_report(results: Path, config: Config, out: Path) -> None:
         {"dataset": display_name(dataset)} | read_json(run.files.dataset(dataset, "agreement.json"))
         for dataset in config.datasets
     )
-    seconds = {}
+    seconds, made = {}, {}
     for dataset, backbone, method in runs(config):
         record = read_json(run.files.run(dataset, backbone, method, "run.json"))
+        made = record.get("made", made)
         stage = "Stage 1" if method == STAGE1 else "Stage 2"
         label = (
             f"{stage}, {display_name(dataset)}, {display_name(backbone)}, {display_name(method)}"
@@ -38,15 +39,17 @@ def build_report(results: Path, config: Config, out: Path) -> None:
     write_report(
         out,
         run.metrics,
-        all_tables(run.metrics),
+        all_tables(run.metrics, config.evaluation.training_spread),
         [
             ReportFigure(section, caption, results / "figures" / f"{name}.png")
             for name, (section, caption, _) in run.all_figures().items()
         ],
         index_agreement=agreement,
-        lambda_searches=[read_json(run.files.search)],
+        lambda_searches=[read_json(path) for path in run.searches().values()],
         config=config.model_dump(mode="json"),
         versions=versions(),
         step_seconds=seconds,
         files=links,
+        made=made,
+        spread=config.evaluation.training_spread,
     )

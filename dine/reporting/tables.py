@@ -3,6 +3,9 @@
 Means are over test pairs; ± is the sample standard deviation over them (ddof = 1). The paper does
 not say which of the two it uses; from ten pairs on they differ by less than 6 %. Chamfer distances
 are squared, symmetric, in the normalised frame, and shown in units of 1e-4 as in the paper.
+
+A dataset whose test pairs are both of objects that were trained on and of others is shown as two:
+under its own name the known objects, and with ``_unseen`` behind it the others.
 """
 
 from __future__ import annotations
@@ -19,20 +22,26 @@ import numpy as np
 import pandas as pd
 
 from dine.errors import DataError
+from dine.evaluation.statistics import verdicts
 from dine.files import atomic_path, write_text
-from dine.results import PAPER_TABLES, table_name
+from dine.results import CLEAN, KNOWN, PAPER_TABLES, UNSEEN, table_name, trained_on, unseen_of
 
 CD_SCALE = 1e4
 COLUMNS = [
-    *("dataset", "backbone", "method", "origin", "pair", "object"),
+    *("dataset", "backbone", "method", "seed", "origin", "pair", "object", "objects", "cluster"),
     *("level", "condition", "corruption", "cd", "cd_observed", "cd_unregistered", "mce"),
 ]
 DATASET_NAMES = {"deformedtissue": "DeformedTissue", "synbench": "SynBench"}
-BACKBONE_NAMES = {"robust_defreg": "Robust-DefReg", "deftransnet": "DefTransNet"}
+BACKBONE_NAMES = {
+    "robust_defreg": "Robust-DefReg",
+    "deftransnet": "DefTransNet",
+    "robust_defreg_geometric": "Robust-DefReg, geometric start",
+}
 METHOD_NAMES = {
     "stage1": "Stage 1",
     "lambda0": "Control (λ = 0)",
     "pca": "DINE-PCA",
+    "pca_residual": "PCA with residual",
     "flow": "DINE-Flow",
     "unregistered": "Unregistered",
 }
@@ -47,18 +56,23 @@ CONDITION_NAMES = {
     "deformation": "Deformation",
     "outliers": "Outliers",
     "noise": "Noise",
-    "resampled": "Resampled target",
+    "resampled": "Other points",
 }
-CORRUPTIONS = ("outliers", "noise")
+CORRUPTIONS = ("outliers", "noise", "resampled")
+OBJECTS_NAMES = {KNOWN: "known objects", UNSEEN: "unseen objects"}
 BASELINES = ("stage1", "lambda0")
 
 _PAPER_TABLES = {
     number: (dataset, CORRUPTIONS if corrupted else ("deformation",))
     for (dataset, corrupted), number in PAPER_TABLES.items()
 }
+_BOLD = (
+    "Bold: lower than the control of the same backbone, and the 95 % interval of the difference "
+    "holds no zero."
+)
 _SETTING = ["condition", "corruption", "level"]
 _SERIES = ["backbone", "method"]
-_TEXT_COLUMNS = ("dataset", *_SERIES, "origin", "pair", "object")
+_TEXT_COLUMNS = ("dataset", *_SERIES, "origin", "pair", "object", "objects", "cluster")
 _DASH = "–"
 # Levels and corruptions that passed through float32 must still meet; real ones lie far apart.
 _KEY_DECIMALS = 6
@@ -102,7 +116,10 @@ def load_metrics(paths: Iterable[str | os.PathLike]) -> pd.DataFrame:
             files contradict each other.
     """
     frames = [_load_one(Path(path)) for path in paths]
-    return combined(frames, ["dataset", *_SERIES, "condition", "corruption", "pair"])
+    metrics = combined(frames, ["dataset", *_SERIES, "seed", "condition", "corruption", "pair"])
+    kinds = metrics.groupby("dataset")["objects"].transform("nunique")
+    apart = (kinds > 1) & (metrics["objects"] == UNSEEN)
+    return metrics.assign(dataset=metrics["dataset"].mask(apart, metrics["dataset"].map(unseen_of)))
 
 
 def combined(frames: Sequence[pd.DataFrame], key: list[str]) -> pd.DataFrame:
@@ -142,7 +159,7 @@ def _load_one(path: Path) -> pd.DataFrame:
     for name in _TEXT_COLUMNS:
         if frame[name].isna().any():
             raise DataError(f"{path}: column {name} is empty in some rows.")
-    for name in ("level", "corruption", "cd", "cd_observed", "cd_unregistered", "mce"):
+    for name in ("seed", "level", "corruption", "cd", "cd_observed", "cd_unregistered", "mce"):
         try:
             frame[name] = pd.to_numeric(frame[name]).astype(float)
         except (TypeError, ValueError) as error:
@@ -155,7 +172,11 @@ def _load_one(path: Path) -> pd.DataFrame:
                 f"{path}: column {name} holds {frame.loc[bad, name].iloc[0]} in data row "
                 f"{int(np.argmax(bad)) + 1}; it must be a finite number of at least 0."
             )
-    for name, allowed in (("condition", CONDITION_NAMES), ("origin", ORIGIN_NAMES)):
+    for name, allowed in (
+        ("condition", CONDITION_NAMES),
+        ("origin", ORIGIN_NAMES),
+        ("objects", OBJECTS_NAMES),
+    ):
         unknown = frame.loc[~frame[name].isin(list(allowed)), name]
         if len(unknown):
             raise DataError(
@@ -222,12 +243,17 @@ def _compare(
     value: str = "cd",
     scale: float = CD_SCALE,
     reference: pd.DataFrame | None = None,
+    spread: float = 0.0,
 ) -> pd.DataFrame:
-    """Tidy numbers of one dataset: ours and, where ``reference`` has them, the published ones."""
+    """Tidy numbers of one dataset: ours and, where ``reference`` has them, the published ones.
+
+    With what each method differs by from the control, as ``statistics.verdicts`` says it.
+    """
     rows = metrics[(metrics["dataset"] == dataset) & metrics["condition"].isin(conditions)]
+    rows = rows[rows[value].notna()]
+    decided = verdicts(rows, "lambda0", value, spread=spread)
     if value == "cd":
         rows = pd.concat([rows, _unregistered(rows)])
-    rows = rows[rows[value].notna()]
     clean = rows["condition"] == "deformation"
     ours = pd.concat(
         [summary(rows[clean], value, scale), summary(rows[~clean], value, scale, pool_levels=True)]
@@ -243,10 +269,14 @@ def _compare(
         how="outer",
     )
     data["n"] = data["n"].fillna(0).astype(int)
-    # As printed: the paper sets equal printed values in bold together. A lone method has no rival.
-    shown = data["mean"].round(4 if value == "mce" else 2)
-    family = shown.groupby([data[name] for name in [*_SETTING, "backbone"]], dropna=False)
-    data["lowest"] = (shown == family.transform("min")) & (family.transform("count") > 1)
+    clean = decided["condition"] == CLEAN
+    decided = decided[decided["level"].notna() == clean]
+    data = data.merge(
+        decided[[*_SETTING, *_SERIES, "relative", "low", "high", "verdict"]],
+        on=[*_SETTING, *_SERIES],
+        how="left",
+    )
+    data["verdict"] = data["verdict"].fillna("")
     data.insert(0, "dataset", dataset)
     data.insert(1, "origin", origin_of(dataset, metrics) or "")
     return data.sort_values([*_SETTING, *_SERIES], key=_sort_key, kind="stable", ignore_index=True)
@@ -267,15 +297,18 @@ def rank(name: str, known: Iterable[str]) -> str:
     return f"{order.index(name) if name in order else len(order):03d} {name}"
 
 
-def gains(metrics: pd.DataFrame) -> pd.DataFrame:
+def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
     """What each prior adds: reductions of the mean Chamfer distance in percent, on shared pairs.
 
     One row per dataset, backbone, prior and setting (deformation by level, corruptions pooled over
     levels). ``gain_over_lambda0`` is the effect of the prior, ``lambda0_gain_over_stage1`` that of
-    the longer training alone; negative values are losses. Only pairs evaluated with every method
-    present count; columns of a method that was not run are missing.
+    the longer training alone; negative values are losses. ``low`` and ``high`` are its 95 %
+    interval and ``verdict`` what follows, as of ``statistics.verdicts``. Only pairs evaluated with
+    every method present count; columns of a method that was not run are missing.
     """
     frame = _rounded(metrics)
+    decided = verdicts(frame, "lambda0", spread=spread)
+    decided = decided[decided["level"].notna() == (decided["condition"] == CLEAN)]
     frame["cd"] = CD_SCALE * frame["cd"]
     frame.loc[frame["condition"] != "deformation", "level"] = np.nan
     records = []
@@ -308,7 +341,12 @@ def gains(metrics: pd.DataFrame) -> pd.DataFrame:
         *("lambda0_gain_over_stage1", "gain_over_stage1", "gain_over_lambda0"),
         "pairs_better_than_lambda0",
     ]
-    return pd.DataFrame(records, columns=columns).sort_values(
+    found = pd.DataFrame(records, columns=columns)
+    # An interval of the difference, turned into one of the reduction.
+    turned = decided.assign(low=-decided["high"], high=-decided["low"])
+    turned = turned[["dataset", *_SERIES, *_SETTING, "low", "high", "verdict"]]
+    found = found.merge(turned, on=["dataset", *_SERIES, *_SETTING], how="left")
+    return found.sort_values(
         ["dataset", *_SERIES, *_SETTING], key=_sort_key, kind="stable", ignore_index=True
     )
 
@@ -320,31 +358,33 @@ def _gain(before: float, after: float) -> float:
 # --------------------------------------------------------------------------------- tables
 
 
-def paper_table(number: int, metrics: pd.DataFrame) -> Table:
+def paper_table(number: int, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
     """Table 1, 2 or 3 of the paper: this run's values with the published ones beneath.
 
     Levels of the run that the paper lacks, and the reverse, both appear.
     """
     dataset, conditions = _PAPER_TABLES[number]
     frame = published()
-    return _cd_table(dataset, metrics, conditions, frame[frame["table"] == number], number)
+    return _cd_table(dataset, metrics, conditions, frame[frame["table"] == number], number, spread)
 
 
-def deformation_table(dataset: str, metrics: pd.DataFrame) -> Table:
+def deformation_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
     """Chamfer distance by deformation level: Table 1 or 2 where the paper has one."""
-    return _any_table(dataset, metrics, ("deformation",))
+    return _any_table(dataset, metrics, (CLEAN,), spread)
 
 
-def corruption_table(dataset: str, metrics: pd.DataFrame) -> Table:
+def corruption_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
     """Chamfer distance under outliers and noise: Table 3 where the paper has one."""
-    return _any_table(dataset, metrics, CORRUPTIONS)
+    return _any_table(dataset, metrics, CORRUPTIONS, spread)
 
 
-def _any_table(dataset: str, metrics: pd.DataFrame, conditions: tuple[str, ...]) -> Table:
+def _any_table(
+    dataset: str, metrics: pd.DataFrame, conditions: tuple[str, ...], spread: float
+) -> Table:
     for number, content in _PAPER_TABLES.items():
         if content == (dataset, conditions):
-            return paper_table(number, metrics)
-    return _cd_table(dataset, metrics, conditions, None, None)
+            return paper_table(number, metrics, spread)
+    return _cd_table(dataset, metrics, conditions, None, None, spread)
 
 
 def _cd_table(
@@ -353,8 +393,9 @@ def _cd_table(
     conditions: tuple[str, ...],
     reference: pd.DataFrame | None,
     number: int | None,
+    spread: float,
 ) -> Table:
-    data = _compare(dataset, metrics, conditions, reference=reference)
+    data = _compare(dataset, metrics, conditions, reference=reference, spread=spread)
     clean = conditions == ("deformation",)
     title = "Increasing deformation" if clean else "Outliers and noise"
     caption = [
@@ -365,7 +406,7 @@ def _cd_table(
         else "to the clean target under outliers (% of the points) and Gaussian noise (σ), pooled "
         "over deformation levels:",
         "mean ± sample standard deviation over test pairs; lower is better.",
-        "Bold: lowest mean of this run within a backbone.",
+        _BOLD,
     ]
     if (data["method"] == "lambda0").any():
         caption.append(
@@ -391,31 +432,31 @@ def _cd_table(
     )
 
 
-def correspondence_table(dataset: str, metrics: pd.DataFrame) -> Table:
+def correspondence_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
     """Mean correspondence error in every setting; pairs without correspondences do not count."""
-    data = _compare(dataset, metrics, tuple(CONDITION_NAMES), value="mce", scale=1.0)
+    data = _compare(dataset, metrics, tuple(CONDITION_NAMES), "mce", 1.0, spread=spread)
     return Table(
         name=f"correspondence_{dataset}",
         title=f"Correspondence error: {display_name(dataset)}",
         caption=f"{_origin_sentence(dataset, metrics, False)} Mean distance between a "
         "registered point and its true counterpart, in the normalised frame, mean ± sample "
         "standard deviation over test pairs; lower is better. Unlike the Chamfer distance it sees "
-        "points that slid along the surface. Bold: lowest mean within a backbone.",
+        f"points that slid along the surface. {_BOLD}",
         **_layout(data, decimals=4, with_paper=False),
         data=data.drop(columns=["published_mean", "published_std"]),
     )
 
 
-def observed_table(dataset: str, metrics: pd.DataFrame) -> Table:
+def observed_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
     """Table 3's settings against the corrupted target that the model sees."""
-    data = _compare(dataset, metrics, CORRUPTIONS, value="cd_observed")
+    data = _compare(dataset, metrics, CORRUPTIONS, "cd_observed", spread=spread)
     return Table(
         name=f"observed_{dataset}",
         title=f"Against the observed target: {display_name(dataset)}",
         caption=f"{_origin_sentence(dataset, metrics, False)} Chamfer distance to the "
         "observed target, with its outliers and noise, in units of 10⁻⁴, mean ± sample standard "
         "deviation over test pairs. A method that follows the corruption scores well here and "
-        "badly against the clean target. Bold: lowest mean within a backbone.",
+        f"badly against the clean target. {_BOLD}",
         **_layout(data, decimals=2, with_paper=False),
         data=data.drop(columns=["published_mean", "published_std"]).rename(
             columns={"mean": "mean_1e-4", "std": "std_1e-4"}
@@ -423,9 +464,9 @@ def observed_table(dataset: str, metrics: pd.DataFrame) -> Table:
     )
 
 
-def gain_table(dataset: str, metrics: pd.DataFrame) -> Table:
+def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
     """What does the prior add over longer training? The rows of ``gains`` for one dataset."""
-    data = gains(metrics[metrics["dataset"] == dataset])
+    data = gains(metrics[metrics["dataset"] == dataset], spread)
     data.insert(1, "origin", origin_of(dataset, metrics) or "")
     rows = []
     for row in data.itertuples(index=False):
@@ -440,6 +481,8 @@ def gain_table(dataset: str, metrics: pd.DataFrame) -> Table:
                     _signed(row.lambda0_gain_over_stage1),
                     _signed(row.gain_over_stage1),
                     _signed(row.gain_over_lambda0),
+                    _interval(row.low, row.high),
+                    _DASH if pd.isna(row.verdict) else row.verdict,
                     _DASH
                     if np.isnan(row.pairs_better_than_lambda0)
                     else f"{row.pairs_better_than_lambda0:.0f} %",
@@ -451,6 +494,8 @@ def gain_table(dataset: str, metrics: pd.DataFrame) -> Table:
         ("Reduction of the mean CD", "Control over Stage 1"),
         ("Reduction of the mean CD", "Prior over Stage 1"),
         ("Reduction of the mean CD", "Prior over control"),
+        ("Reduction of the mean CD", "95 % interval"),
+        ("", "Verdict"),
         ("", "Pairs better than control"),
     )
     return Table(
@@ -458,7 +503,9 @@ def gain_table(dataset: str, metrics: pd.DataFrame) -> Table:
         title=f"What does the prior add over longer training? {display_name(dataset)}",
         caption=f"{_origin_sentence(dataset, metrics, False)} Reduction of the mean "
         "Chamfer distance in percent on the pairs that all methods share; negative values are "
-        "losses. The control differs from the prior only in λ = 0.",
+        "losses. The control differs from the prior only in λ = 0. The interval is that of the "
+        "reduction over the control: of the test pairs, drawn by deformation where the object is "
+        f"known and by object otherwise{_spread_text(spread)}. Undecided: it holds zero.",
         header=header,
         rows=tuple(rows),
         data=data.rename(
@@ -466,27 +513,30 @@ def gain_table(dataset: str, metrics: pd.DataFrame) -> Table:
             | {
                 name: f"{name}_percent"
                 for name in data
-                if "gain" in name or name.startswith("pairs_")
+                if "gain" in name or name.startswith("pairs_") or name in ("low", "high")
             }
         ),
     )
 
 
-def all_tables(metrics: pd.DataFrame) -> list[Table]:
-    """Every table that the metrics have rows for: the paper's first, then the supplementary."""
+def all_tables(metrics: pd.DataFrame, spread: float = 0.0) -> list[Table]:
+    """Every table that the metrics have rows for: the paper's first, then the supplementary.
+
+    ``spread`` is how much differences vary with the training; see ``statistics.verdicts``.
+    """
     tables, comparisons, supplementary = [], [], []
     for dataset in sorted(metrics["dataset"].unique(), key=lambda name: rank(name, DATASET_NAMES)):
         rows = metrics[metrics["dataset"] == dataset]
         corrupted = rows["condition"].isin(CORRUPTIONS)
         if (rows["condition"] == "deformation").any():
-            tables.append(deformation_table(dataset, rows))
+            tables.append(deformation_table(dataset, rows, spread))
         if corrupted.any():
-            tables.append(corruption_table(dataset, rows))
-            supplementary.append(observed_table(dataset, rows))
+            tables.append(corruption_table(dataset, rows, spread))
+            supplementary.append(observed_table(dataset, rows, spread))
         if rows["mce"].notna().any():
-            supplementary.append(correspondence_table(dataset, rows))
+            supplementary.append(correspondence_table(dataset, rows, spread))
         if len(gains(rows)):
-            comparisons.append(gain_table(dataset, rows))
+            comparisons.append(gain_table(dataset, rows, spread))
     tables.sort(key=lambda table: (not table.name.startswith("table"), table.name))
     return tables + comparisons + supplementary
 
@@ -499,12 +549,15 @@ def origin_of(dataset: str, metrics: pd.DataFrame) -> str | None:
 
 def _origin_sentence(dataset: str, metrics: pd.DataFrame, with_paper: bool) -> str:
     origin = origin_of(dataset, metrics)
-    name = display_name(dataset)
+    known = trained_on(dataset)
+    name = display_name(known)
     if origin is None:
         return f"This run has no results on {name}; only the published values are shown."
-    if dataset not in DATASET_NAMES or origin not in ("synthetic", "bases"):
-        return f"DINE on {name} ({ORIGIN_NAMES[origin]})."
-    text = f"DINE on {ORIGIN_NAMES[origin]} in the layout of {name}"
+    rows = metrics[metrics["dataset"] == dataset]
+    objects = " and ".join(OBJECTS_NAMES[kind] for kind in sorted(set(rows["objects"])))
+    if known not in DATASET_NAMES or origin not in ("synthetic", "bases"):
+        return f"DINE on {name} ({ORIGIN_NAMES[origin]}), {objects}."
+    text = f"DINE on {ORIGIN_NAMES[origin]} in the layout of {name}, {objects}"
     if with_paper:
         text += (
             f"; published values are on the real {name} data and are not comparable in absolute "
@@ -535,7 +588,8 @@ def _layout(data: pd.DataFrame, decimals: int, with_paper: bool) -> dict:
                 paper.append(Cell(_DASH))
                 continue
             value = values.loc[key]
-            ours.append(Cell(_plus_minus(value["mean"], value["std"], decimals), value["lowest"]))
+            text = _plus_minus(value["mean"], value["std"], decimals)
+            ours.append(Cell(text, value["verdict"] == "lower"))
             # The paper prints its Table 3 with one decimal.
             digits = 2 if setting[0] == "deformation" else 1
             paper.append(Cell(_plus_minus(value["published_mean"], value["published_std"], digits)))
@@ -549,6 +603,9 @@ def _layout(data: pd.DataFrame, decimals: int, with_paper: bool) -> dict:
 
 def display_name(key: str) -> str:
     """The name to show for a dataset, backbone or method; unknown ones are shown as they are."""
+    known = trained_on(key)
+    if known != key:
+        return f"{display_name(known)}, {OBJECTS_NAMES[UNSEEN]}"
     return {**DATASET_NAMES, **BACKBONE_NAMES, **METHOD_NAMES}.get(key, key)
 
 
@@ -583,6 +640,19 @@ def _count(counts: pd.Series) -> str:
         return _DASH
     low, high = counts.min(), counts.max()
     return f"{low}" if low == high else f"{low}{_DASH}{high}"
+
+
+def _interval(low: float, high: float) -> str:
+    if np.isnan(low):
+        return _DASH
+    return f"{low:+.0f} to {high:+.0f} %".replace("-", "−")
+
+
+def _spread_text(spread: float) -> str:
+    """What an interval holds besides the chance of the pairs."""
+    if not spread:
+        return ""
+    return f", and of the training, from run to run ± {100 * spread:g} % (standard deviation)"
 
 
 def _signed(percent: float) -> str:

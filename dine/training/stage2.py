@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 from dine.config import CONTROL, Compute, LambdaSearch, Stage2
@@ -88,8 +89,9 @@ def search_lambda(
 ) -> None:
     """Try each λ on a shortened Stage 2; the lowest mean of the criterion on validation pairs wins.
 
-    λ = 0 is trained too, once, for comparison, but never chosen. Each candidate's result is kept,
-    so that an interrupted search goes on with the next one.
+    Where the best lies at the edge of the grid, the grid goes on there, at most ``search.extend``
+    times for each prior. λ = 0 is trained too, once, for comparison, but never chosen. Each
+    candidate's result is kept, so that an interrupted search goes on with the next one.
     """
     # One validation, at the end, on more pairs than training looks at.
     settings = stage.model_copy(
@@ -100,10 +102,8 @@ def search_lambda(
         }
     )
     folder = out.with_name(f"{out.stem}_candidates")
-    curve = []
-    runs: list[tuple[str, float]] = [(CONTROL, 0.0)]
-    runs += [(prior, weight) for prior in priors for weight in sorted(search.candidates)]
-    for prior, weight in runs:
+
+    def errors(prior: str, weight: float) -> dict[str, float]:
         here = folder / f"{prior}_{weight:g}"
         stage2(
             pairs,
@@ -118,14 +118,21 @@ def search_lambda(
             compute=compute,
         )
         final = read_json(here / "run.json")["final"]
-        # The control is every prior's value at λ = 0.
-        for label in priors if prior == CONTROL else (prior,):
-            errors = {name.removeprefix("val_"): final[name] for name in VALIDATION_COLUMNS}
-            curve.append({"prior": label, "lambda": weight, **errors})
-    selected = {}
+        return {name.removeprefix("val_"): final[name] for name in VALIDATION_COLUMNS}
+
+    control = errors(CONTROL, 0.0)
+    curve, selected = [], {}
     for prior in priors:
-        tried = [row for row in curve if row["prior"] == prior and row["lambda"] > 0]
-        selected[prior] = min(tried, key=lambda row: row[search.criterion])["lambda"]
+        tried = {weight: errors(prior, weight) for weight in sorted(search.candidates)}
+        for _ in range(search.extend):
+            further = beyond_the_edge({x: found[search.criterion] for x, found in tried.items()})
+            if further is None:
+                break
+            tried[further] = errors(prior, further)
+        selected[prior] = min(sorted(tried), key=lambda weight: tried[weight][search.criterion])
+        # The control is every prior's value at λ = 0.
+        rows = {0.0: control, **dict(sorted(tried.items()))}
+        curve += [{"prior": prior, "lambda": weight, **found} for weight, found in rows.items()]
     write_json(
         out,
         {
@@ -140,3 +147,18 @@ def search_lambda(
             "seed": seed,
         },
     )
+
+
+def beyond_the_edge(tried: Mapping[float, float]) -> float | None:
+    """The next λ to try where the best of the tried ones, by value, is the largest or smallest.
+
+    It is as many times larger or smaller as the last two are apart; None where the best lies inside
+    the grid, or there is only one.
+    """
+    weights = sorted(tried)
+    if len(weights) < 2:
+        return None
+    best = min(weights, key=tried.__getitem__)
+    inner = {weights[0]: weights[1], weights[-1]: weights[-2]}.get(best)
+    # Rounded, so that names and numbers of 1e-4 · 10 are those of 1e-3.
+    return None if inner is None else float(f"{best * best / inner:.6g}")

@@ -64,7 +64,9 @@ def starting_backbone(kind: str, arguments: dict[str, Any], start: str, seed: in
         return backbone
     path = shipped_weights(kind) if start == "pretrained" else Path(start)
     given, _ = load_backbone(path)
-    if given.registered_name != backbone.registered_name or given.arguments != backbone.arguments:
+    # How random weights start is no matter where weights are given.
+    theirs, ours = ({**x.arguments, "initialisation": None} for x in (given, backbone))
+    if given.registered_name != backbone.registered_name or theirs != ours:
         raise CheckpointError(
             f"{path} holds {given.registered_name} with {given.arguments}; the configuration asks "
             f"for {backbone.registered_name} with {backbone.arguments}."

@@ -1,6 +1,7 @@
 # Shared by all rules. The checked configuration, paths, names and parameters.
 
 import json
+import os
 import shlex
 import shutil
 import sys
@@ -11,7 +12,7 @@ from snakemake.exceptions import WorkflowError
 
 from dine import config as dine_config
 from dine.errors import ConfigError
-from dine.provenance import code_digest, folder_signature
+from dine.provenance import COMMAND, code_digest, folder_signature
 from dine.results import (
     Results,
     NO_BACKBONE,
@@ -21,6 +22,7 @@ from dine.results import (
     evidence_groups,
     evidence_names,
     figure_names,
+    own_searches,
     pca_priors,
     replica,
     runs,
@@ -37,6 +39,7 @@ FILES = Results(RESULTS)
 FIGURES = figure_names(CONFIG)
 TABLES = table_names(CONFIG)
 RUNS = runs(CONFIG)
+SEARCHES = [FILES.search, *(FILES.search_of(name) for name in own_searches(CONFIG))]
 # Once: to look through all of them for each job would take minutes for thousands of jobs.
 GROUPS = evidence_groups(CONFIG)
 
@@ -44,6 +47,9 @@ GROUPS = evidence_groups(CONFIG)
 shell.prefix(
     f"set -euo pipefail; export PATH={str(Path(sys.executable).parent)!r}:$PATH; "
 )
+
+# What a user asked for, for the records of what it gave; jobs are started by other commands.
+os.environ.setdefault(COMMAND, shlex.join(["snakemake", *sys.argv[1:]]))
 
 GPUS = int(
     CONFIG.device == "cuda"
@@ -136,6 +142,42 @@ def raw_settings(wildcards):
     )
 
 
+def unseen_settings(wildcards):
+    """As ``raw_settings``, of the further objects."""
+    dataset = CONFIG.datasets[wildcards.dataset]
+    unseen = dataset.unseen
+    settings = {"pairs": {"points": dataset.pairs.points}}
+    changes = {"pairs_per_level": unseen.pairs_per_level}
+    if unseen.folder is None:
+        changes["objects"] = unseen.objects
+    else:
+        settings["source"] = {"kind": "path", "folder": unseen.folder}
+    settings["recipe"] = dataset.recipe.model_copy(update=changes).model_dump()
+    return json.dumps(settings, sort_keys=True)
+
+
+def unseen_signature(wildcards):
+    folder = CONFIG.datasets[wildcards.dataset].unseen.folder
+    return folder_signature(Path(folder).expanduser()) if folder else ""
+
+
+def raw_files(wildcards):
+    """The raw files of a dataset, and of its further objects."""
+    found = {"raw": FILES.dataset(wildcards.dataset, "raw.json")}
+    if CONFIG.datasets[wildcards.dataset].unseen:
+        found["unseen"] = FILES.dataset(wildcards.dataset, "unseen/raw.json")
+    return found
+
+
+def unseen_option(wildcards, input):
+    return options("--unseen", [input.unseen]) if "unseen" in input.keys() else ""
+
+
+def most_option(wildcards):
+    most = CONFIG.datasets[wildcards.dataset].corruption.pairs
+    return options("--most", [most]) if most else ""
+
+
 def raw_signature(wildcards):
     """Changes when a user's own folder does; Snakemake cannot know which files will be read."""
     source = CONFIG.datasets[wildcards.dataset].source
@@ -181,6 +223,15 @@ def backbone_settings(wildcards):
     )
 
 
+def search_file(wildcards):
+    """The search of λ that counts for a backbone."""
+    name, _ = backbone_and_seed(CONFIG, wildcards.backbone)
+    searching = CONFIG.searching(name)
+    if searching == CONFIG.lambda_search.backbone:
+        return FILES.search
+    return FILES.search_of(searching)
+
+
 def prior_settings(wildcards):
     prior = CONFIG.priors[wildcards.prior]
     return json.dumps(
@@ -221,10 +272,11 @@ def calibrating_prior(wildcards):
 
 def priors_from(*names):
     """Some files of each dataset, and all that lies between them and the priors."""
-    found = [FILES.search]
+    found = [*SEARCHES]
     for dataset in CONFIG.datasets:
         found += [FILES.dataset(dataset, name) for name in names]
-        for backbone, settings in CONFIG.backbones.items():
+        for backbone in CONFIG.backbones_of(dataset):
+            settings = CONFIG.backbones[backbone]
             if settings.priors:
                 found.append(FILES.dataset(dataset, f"{backbone}/dvf.h5"))
             found += [
@@ -237,6 +289,9 @@ def kept_files():
     """What `all` makes on its way; named as its inputs so that a deleted file is made again."""
     found = [RESULTS / "config.yaml"]
     found += priors_from("raw.json", "pairs.h5", "agreement.json")
+    for dataset, settings in CONFIG.datasets.items():
+        if settings.unseen:
+            found.append(FILES.dataset(dataset, "unseen/raw.json"))
     found += [
         FILES.variant(dataset, *condition)
         for dataset in CONFIG.datasets
@@ -262,7 +317,7 @@ def evidence_raw_settings(wildcards):
     if test_set:
         settings["source"] = {"kind": "path", "folder": test_set.folder}
     else:
-        changes = {"objects": CONFIG.evidence.test_objects}
+        changes = {"objects": CONFIG.evidence.test_objects, "pairs_per_level": 1}
         settings["recipe"] = dataset.recipe.model_copy(update=changes).model_dump()
     return json.dumps(settings, sort_keys=True)
 

@@ -28,14 +28,23 @@ rule fit_prior:
 SEARCH = CONFIG.lambda_search
 
 
+def search_settings(backbone):
+    changes = {"backbone": backbone, "priors": CONFIG.searched(backbone)}
+    return section(SEARCH.model_copy(update=changes))
+
+
+def searched_priors(backbone):
+    return [
+        FILES.prior(SEARCH.dataset, backbone, prior)
+        for prior in CONFIG.searched(backbone)
+    ]
+
+
 rule search_lambda:
     input:
         pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
         model=FILES.run(SEARCH.dataset, SEARCH.backbone, "stage1", "model.safetensors"),
-        priors=[
-            FILES.prior(SEARCH.dataset, SEARCH.backbone, prior)
-            for prior in SEARCH.priors
-        ],
+        priors=searched_priors(SEARCH.backbone),
     output:
         FILES.search,
     log:
@@ -49,16 +58,18 @@ rule search_lambda:
     resources:
         **request("training"),
     params:
-        priors=lambda wildcards, input: options("--prior", SEARCH.priors, input.priors),
+        priors=lambda wildcards, input: options(
+            "--prior", CONFIG.searched(SEARCH.backbone), input.priors
+        ),
         stage2=section(CONFIG.stage2),
-        settings=section(SEARCH),
+        settings=search_settings(SEARCH.backbone),
         seed=CONFIG.seed,
         compute=COMPUTE,
         code=code_of(
             "search-lambda",
             SEARCH.backbone,
             data_term=CONFIG.stage2.data_term,
-            priors=SEARCH.priors,
+            priors=CONFIG.searched(SEARCH.backbone),
         ),
     shell:
         "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
@@ -66,3 +77,40 @@ rule search_lambda:
         " --settings {params.settings:q} --seed {params.seed}"
         " {params.compute} --processes {resources.processes}"
         " --out {output:q}"
+
+
+# With a backbone of its own: `own_lambda`.
+use rule search_lambda as search_own_lambda with:
+    input:
+        pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
+        model=RESULTS / SEARCH.dataset / "{searching}" / "stage1" / "model.safetensors",
+        priors=[
+            RESULTS
+            / SEARCH.dataset
+            / "{searching}"
+            / "priors"
+            / f"{prior}.safetensors"
+            for prior in SEARCH.priors
+        ],
+    output:
+        RESULTS / "lambda" / "{searching}" / "lambda.json",
+    log:
+        LOGS / "search_lambda_{searching}.log",
+    benchmark:
+        BENCHMARKS / "search_lambda_{searching}.tsv"
+    wildcard_constraints:
+        searching="|".join(own_searches(CONFIG)) or NOTHING,
+    params:
+        priors=lambda wildcards, input: options(
+            "--prior", CONFIG.searched(wildcards.searching), input.priors
+        ),
+        stage2=section(CONFIG.stage2),
+        settings=lambda wildcards: search_settings(wildcards.searching),
+        seed=CONFIG.seed,
+        compute=COMPUTE,
+        code=lambda wildcards: code_of(
+            "search-lambda",
+            wildcards.searching,
+            data_term=CONFIG.stage2.data_term,
+            priors=CONFIG.searched(wildcards.searching),
+        ),

@@ -31,9 +31,11 @@ rule tables:
     resources:
         **request("reporting"),
     params:
+        spread=CONFIG.evaluation.training_spread,
         code=code_digest("tables"),
     shell:
-        'dine --log {log:q} tables {input:q} --out "$(dirname -- {output.all:q})"'
+        "dine --log {log:q} tables {input:q} --spread {params.spread}"
+        ' --out "$(dirname -- {output.all:q})"'
 
 
 rule figures:
@@ -45,7 +47,7 @@ rule figures:
             for name in ("predictions.h5", "point_errors.h5", "history.csv")
         ],
         [FILES.dataset(dataset, "pairs.h5") for dataset in CONFIG.datasets],
-        rules.search_lambda.output,
+        SEARCHES,
     output:
         figures=[
             report(
@@ -101,7 +103,7 @@ rule html:
         rules.tables.output,
         rules.figures.output,
         rules.resolved_config.output,
-        rules.search_lambda.output,
+        SEARCHES,
     output:
         report(
             RESULTS / "report.html", caption="../report/report.rst", category="Report"
@@ -132,7 +134,7 @@ for PRIOR in CONFIG.priors:
             [
                 FILES.run(dataset, backbone, method, "metrics.csv")
                 for dataset in CONFIG.datasets
-                for backbone in CONFIG.backbones
+                for backbone in CONFIG.backbones_of(dataset)
                 if PRIOR in CONFIG.backbones[backbone].priors
                 for method in (dine_config.STAGE1, dine_config.CONTROL, PRIOR)
             ],
@@ -147,9 +149,11 @@ for PRIOR in CONFIG.priors:
         resources:
             **request("reporting"),
         params:
+            spread=CONFIG.evaluation.training_spread,
             code=code_digest("tables"),
         shell:
-            'dine --log {log:q} tables {input:q} --out "$(dirname -- {output:q})"'
+            "dine --log {log:q} tables {input:q} --spread {params.spread}"
+            ' --out "$(dirname -- {output:q})"'
 
 
 # Handles for parts of the work.

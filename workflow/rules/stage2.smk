@@ -40,7 +40,7 @@ rule stage2_prior:
         / "{backbone}"
         / "priors"
         / "{prior_of_stage2}.safetensors",
-        weight=rules.search_lambda.output,
+        weight=search_file,
     output:
         **stage2_outputs("{prior_of_stage2}"),
     log:
