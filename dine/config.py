@@ -571,6 +571,12 @@ class Config(Compute):
                 raise ValueError(
                     f"a dataset cannot be called {name!r}; the ending stands for unseen objects"
                 )
+        for name in self.datasets:
+            if not self.backbones_of(name):
+                raise ValueError(
+                    f"no backbone is trained on the dataset {name!r}; add it to the `datasets` of "
+                    "one under `backbones`, or take it away"
+                )
         search = self.lambda_search
         self._known("datasets", search.dataset, "lambda_search.dataset")
         self._known("backbones", search.backbone, "lambda_search.backbone")
