@@ -615,6 +615,11 @@ class Config(Compute):
                     "letters, digits and underscores"
                 )
         for name, backbone in self.evidence.backbones.items():
+            if backbone.own_lambda:
+                raise ValueError(
+                    f"`evidence.backbones.{name}.own_lambda` cannot be set: the evidence takes the "
+                    "λ of `lambda_search`; move the backbone to `backbones`, or leave this out"
+                )
             for prior in backbone.priors:
                 self._known("priors", prior, f"evidence.backbones.{name}.priors")
             for dataset in backbone.datasets or ():
