@@ -662,7 +662,8 @@ class Config(Compute):
                         f"{', '.join(sorted(trained))}"
                     )
 
-        known = {*taken, *self.evidence.methods}
+        # A prior that no backbone is trained with is not drawn, as a method that was taken away.
+        known = {*taken, *self.priors, *self.evidence.methods}
         unknown = [name for name in self.evidence.examples if name not in known]
         if unknown:
             raise ValueError(
