@@ -571,6 +571,12 @@ class Config(Compute):
                 raise ValueError(
                     f"a dataset cannot be called {name!r}; the ending stands for unseen objects"
                 )
+        for name in self.datasets:
+            if not self.backbones_of(name):
+                raise ValueError(
+                    f"no backbone is trained on the dataset {name!r}; add it to the `datasets` of "
+                    "one under `backbones`, or take it away"
+                )
         search = self.lambda_search
         self._known("datasets", search.dataset, "lambda_search.dataset")
         self._known("backbones", search.backbone, "lambda_search.backbone")
@@ -609,6 +615,11 @@ class Config(Compute):
                     "letters, digits and underscores"
                 )
         for name, backbone in self.evidence.backbones.items():
+            if backbone.own_lambda:
+                raise ValueError(
+                    f"`evidence.backbones.{name}.own_lambda` cannot be set: the evidence takes the "
+                    "λ of `lambda_search`; move the backbone to `backbones`, or leave this out"
+                )
             for prior in backbone.priors:
                 self._known("priors", prior, f"evidence.backbones.{name}.priors")
             for dataset in backbone.datasets or ():
@@ -651,7 +662,8 @@ class Config(Compute):
                         f"{', '.join(sorted(trained))}"
                     )
 
-        known = {*taken, *self.evidence.methods}
+        # A prior that no backbone is trained with is not drawn, as a method that was taken away.
+        known = {*taken, *self.priors, *self.evidence.methods}
         unknown = [name for name in self.evidence.examples if name not in known]
         if unknown:
             raise ValueError(

@@ -209,15 +209,26 @@ def table_name(dataset: str, corrupted: bool) -> str:
 def table_names(config: Config) -> list[str]:
     """Stems of all tables of a run."""
     names = []
-    for dataset in config.datasets:
-        names.append(table_name(dataset, corrupted=False))
-        if conditions(config, dataset):
-            names += [table_name(dataset, corrupted=True), f"observed_{dataset}"]
-        shown = [dataset]
-        if config.datasets[dataset].unseen:
-            shown.append(unseen_of(dataset))
-            names.append(table_name(shown[-1], corrupted=False))
-        names += [f"correspondence_{name}" for name in shown]
-        if any(backbone.priors for backbone in config.backbones.values()):
-            names += [f"gains_{name}" for name in shown]
+    for dataset, settings in config.datasets.items():
+        corruption = settings.corruption
+        for shown in [dataset, *([unseen_of(dataset)] if _shown_apart(config, dataset) else [])]:
+            names.append(table_name(shown, corrupted=False))
+            # A number of pairs is of known objects alone.
+            if conditions(config, dataset) and (shown == dataset or corruption.pairs is None):
+                names += [table_name(shown, corrupted=True), f"observed_{shown}"]
+            names.append(f"correspondence_{shown}")
+            if any(config.backbones[name].priors for name in config.backbones_of(dataset)):
+                names.append(f"gains_{shown}")
     return names
+
+
+def _shown_apart(config: Config, dataset: str) -> bool:
+    """Whether unseen objects are sure to have tables of their own.
+
+    Where all test pairs are of unseen objects they are not told apart, and only a run finds out
+    what the split of a user's own data, or a published one, says.
+    """
+    settings = config.datasets[dataset]
+    split = settings.pairs.split
+    known = split.by == "deformation" and split.train > 0 and split.test > 0
+    return bool(settings.unseen) and known and settings.source.kind == "synthetic"

@@ -165,7 +165,7 @@ def make_pairs(
     they may be one deformation at several levels. A published split (``inventory.split``) is kept
     as it is: by pair id or name where it has that, otherwise by object; objects in two of its parts
     are logged and kept. Where it has no ``val``, some of its training objects become ``val``, or,
-    where all of these are tested on as well, some of their deformations.
+    where all of these (but one) are tested on as well, some of their deformations.
 
     Attributes of the result: ``seed``, ``convention``, ``points``, ``origin``, ``split_rule``
     (``objects``, ``deformations`` or ``published``), ``split_train``, ``split_val``,
@@ -461,6 +461,8 @@ def _published_split(
         apart = training - set(leaking)
         total = fractions["train"] + fractions["val"]
         shares = {part: fractions[part] / total for part in ("train", "val")}
+        if len(apart) < len(shares):
+            apart = set()
         carved = [
             index
             for index, part in enumerate(parts)
@@ -468,7 +470,7 @@ def _published_split(
         ]
         by = "object"
         if not apart:
-            # Where all are known, what is not are deformations of those that have several.
+            # Where all (but one) are known, deformations of those that have several are not.
             names = {(objects[index], deformation_of(rows[index]["name"])) for index in carved}
             count = Counter(name for name, _ in names)
             several = [index for index in carved if count[objects[index]] >= len(shares)]

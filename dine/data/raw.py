@@ -34,7 +34,7 @@ from dine.data.layout import Inventory
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.data.synthetic import primitive, tissue_patch
-from dine.errors import DataError, StorageError
+from dine.errors import ConfigError, DataError, StorageError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
 from dine.provenance import code_digest
 
@@ -87,6 +87,7 @@ def write_dataset(
 
     Raises:
         ValueError: a parameter outside its range, or repeated.
+        ConfigError: percentages and widths too close together for so many pairs.
         DataError: no object is usable (a single unusable one is left out, with a warning and its
             reason in provenance.json), or ``folder`` holds something that DINE did not make.
         StorageError: the folder cannot be written.
@@ -362,10 +363,10 @@ def _kernels(parameters: dict[str, Any], *key: int | str) -> list[tuple[float, f
         drawn = tuple(_rounded(rng.uniform(min(some), max(some))) for some in (percents, widths))
         vain = vain + 1 if drawn in written else 0
         if vain > _VAIN_DRAWS:
-            raise ValueError(
-                f"pairs_per_level is {parameters['pairs_per_level']}, but control_percents and "
-                f"widths lie so close together that only {len(kernels)} different deformations "
-                "were found; widen one of the two."
+            raise ConfigError(
+                f"`pairs_per_level` is {parameters['pairs_per_level']}, but `control_percents` "
+                f"and `widths` lie so close together that only {len(kernels)} different "
+                "deformations were found; widen one of the two."
             )
         if not vain:
             written.add(drawn)

@@ -331,10 +331,11 @@ def evidence_pair_settings(wildcards):
     return section(CONFIG.datasets[CONFIG.networks(wildcards.dataset)].pairs)
 
 
-def evidence_raw_file(wildcards):
+def evidence_raw_files(wildcards):
+    """The raw files that the pairs of the evidence are made of."""
     if has_own_pairs(wildcards.dataset):
-        return FILES.evidence(wildcards.dataset, "raw.json")
-    return FILES.dataset(wildcards.dataset, "raw.json")
+        return [FILES.evidence(wildcards.dataset, "raw.json")]
+    return list(raw_files(wildcards).values())
 
 
 def evidence_pairs_file(wildcards):
@@ -480,7 +481,7 @@ def evidence_kept():
     found = [FILES.prior(*prior) for prior in diagnosed_priors()]
     for (dataset, backbone, seed), cells in GROUPS.items():
         place = Namespace(dataset=dataset)
-        found += [evidence_raw_file(place), evidence_pairs_file(place)]
+        found += [*evidence_raw_files(place), evidence_pairs_file(place)]
         found += [*evidence_variants(place), *cell_predictions(cells)]
         if backbone == NO_BACKBONE:
             continue

@@ -89,7 +89,7 @@ rule evidence_corrupt:
 rule evidence_resample:
     input:
         pairs=evidence_pairs_file,
-        raw=evidence_raw_file,
+        raws=evidence_raw_files,
     output:
         EVIDENCE / "{dataset}" / "variants" / "resampled_1.h5",
     log:
@@ -99,11 +99,12 @@ rule evidence_resample:
     resources:
         **request("data"),
     params:
+        raws=lambda wildcards, input: options("--raw", input.raws),
         levels=evidence_levels,
         seed=CONFIG.seed,
         code=code_digest("resample"),
     shell:
-        "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
+        "dine --log {log:q} resample {params.raws} --pairs {input.pairs:q}"
         " {params.levels} --seed {params.seed} --out {output:q}"
 
 

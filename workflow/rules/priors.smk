@@ -34,6 +34,7 @@ def search_settings(backbone):
 
 
 def searched_priors(backbone):
+    """Files of the priors, in the order in which they are searched."""
     return [
         FILES.prior(SEARCH.dataset, backbone, prior)
         for prior in CONFIG.searched(backbone)
@@ -84,14 +85,7 @@ use rule search_lambda as search_own_lambda with:
     input:
         pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
         model=RESULTS / SEARCH.dataset / "{searching}" / "stage1" / "model.safetensors",
-        priors=[
-            RESULTS
-            / SEARCH.dataset
-            / "{searching}"
-            / "priors"
-            / f"{prior}.safetensors"
-            for prior in SEARCH.priors
-        ],
+        priors=lambda wildcards: searched_priors(wildcards.searching),
     output:
         RESULTS / "lambda" / "{searching}" / "lambda.json",
     log:
