@@ -31,6 +31,7 @@ check: .venv/installed
 	$(BIN)/dine config check config.yaml
 	$(BIN)/dine config check config.yaml config/tiny.yaml
 	$(BIN)/dine config check config.yaml config/full.yaml
+	$(BIN)/dine config check config.yaml config/unseen.yaml
 	$(BIN)/snakemake all -n --quiet
 
 format: .venv/installed
