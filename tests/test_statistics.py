@@ -31,6 +31,7 @@ def rows(method, mce, *, seed=0, levels=(0.5,), per_object=1, **changes):
                 {
                     **{"dataset": "d", "backbone": "b", "method": method, "seed": seed},
                     **{"pair": f"{level}/{i}", "object": str(i // per_object), "level": level},
+                    "cluster": str(i // per_object),
                     **{"condition": "deformation", "corruption": 0.0},
                     **{"cd": value**2, "mce": value, "hd95": 2 * value},
                     **{"accuracy_2_5": 0.5, "accuracy_5": 0.75, "far_points": 0.25},
