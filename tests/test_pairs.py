@@ -445,8 +445,8 @@ def test_one_deformation_at_several_levels_stays_together(inventory):
 
 def test_levels_are_shared_by_hand():
     share = {"train": 0.5, "test": 0.5}
-    # Each level's first goes to train, which is first among equals, and its second to test.
-    assert making._share_levels([[1], [2], [1], [2]], share) == ["train", "train", "test", "test"]
+    # Both parts lack one pair of either level; the object's balance decides, then the level's.
+    assert making._share_levels([[1], [2], [1], [2]], share) == ["train", "test", "test", "train"]
     # What is left must go where nothing is yet.
     assert making._share_levels([[1], [2]], {"train": 0.9, "test": 0.1}) == ["train", "test"]
 
@@ -503,7 +503,7 @@ def test_evaluated_pairs_are_spread_over_levels_and_of_known_objects(pairs):
     assert set(evaluated_pairs(some, [0.4], most=2).level) == {0.4}
     unknown = replace(some, split=np.full(10, "test"))
     assert len(evaluated_pairs(unknown, most=100)) == 10
-    with pytest.raises(DataError, match="no pairs of the levels 0.3"):
+    with pytest.raises(DataError, match=r"no pairs of the levels 0\.3"):
         evaluated_pairs(some, [0.3], most=2)
 
 

@@ -137,7 +137,7 @@ def command_of(arguments: list[str]) -> str:
 
 TIMED_FOLDERS = ("logs", "benchmarks", "training")
 """Logs and Snakemake's benchmarks; ``training/`` is the state, whose history has seconds."""
-TIMED_KEYS = ("training_seconds", "wall_seconds", "seconds")
+TIMED_KEYS = ("training_seconds", "wall_seconds", "seconds", "made")
 """Of ``run.json`` and other JSON files."""
 TIMED_COLUMNS = ("seconds", "seconds_mean", "seconds_sd", "seconds_seed_sd")
 """Of ``history.csv`` and ``metrics.csv``, and of the evidence's tables of means."""
