@@ -218,7 +218,7 @@ def test_strengths_of_a_condition_are_one_effect_of_pairs_drawn_together():
     noise = noise[noise["condition"] == "noise"]
     found = effects(pd.concat([noise, noise.assign(corruption=0.05)]))
     assert found[["condition", "pairs", "clusters", "relative"]].round(6).to_numpy().tolist() == [
-        ["noise", 12, 6, -25]
+        ["noise", 12, 3, -25]
     ]
 
 

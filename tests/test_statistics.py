@@ -299,7 +299,7 @@ def test_compare_against_naive_computations():
     apart = compare(metrics.assign(cluster=metrics["pair"]), "new", "old", values=["mce"])
     row = only(apart, level=0.2)
     assert (row["objects"], row["clusters"]) == (5, 20)
-    expected = cluster_bootstrap(new[0] - old[0], np.arange(20))
+    expected = cluster_bootstrap(new[0] - old[0], [f"0.2/{i}" for i in range(20)])
     assert (row["ci_low"], row["ci_high"]) == pytest.approx(expected)
     squared = only(table, level=0.2, value="cd")
     assert squared["difference"] == pytest.approx((new[0] ** 2 - old[0] ** 2).mean())
