@@ -45,7 +45,10 @@ def chain(tmp_path_factory):
     dine(
         *("search-lambda", "--pairs", pairs, "--model", model, "--out", root / "lambda.json"),
         *("--prior", "pca", root / "pca.safetensors", "--stage2", STAGE2),
-        *("--settings", '{"candidates": [0.001, 0.1], "steps": 2, "validation_pairs": 1}'),
+        *(
+            "--settings",
+            '{"candidates": [0.001, 0.1], "extend": 0, "steps": 2, "validation_pairs": 1}',
+        ),
     )
     return root
 

@@ -11,10 +11,14 @@ from dine.errors import ConfigError
 from dine.results import (
     NO_BACKBONE,
     backbone_and_seed,
+    conditions,
     evidence_cells,
     evidence_conditions,
     figure_names,
+    own_searches,
     replica,
+    runs,
+    strengths,
     table_names,
 )
 
@@ -33,7 +37,7 @@ def changed(path, value):
 def test_default_is_valid_and_complete():
     loaded = config.load(ROOT / "config.yaml")
     assert list(loaded.datasets) == ["deformedtissue", "synbench"]
-    assert loaded.methods("deftransnet") == ["stage1", "lambda0", "pca", "flow"]
+    assert loaded.methods("deftransnet") == ["stage1", "lambda0", "pca", "pca_residual", "flow"]
     assert {"table1", "table2", "table3"} <= set(table_names(loaded))
     assert len(set(figure_names(loaded))) == len(figure_names(loaded))
 
@@ -79,7 +83,41 @@ def test_schema_file_is_in_step_with_the_code():
         ("processes", 2, r"`stage1\.batch_size` is 1, which 2 processes cannot share equally"),
         ("datasets.synbench.recipe.levels", [], r"levels` is \[\]"),
         ("datasets.synbench.recipe.levels", [0.1, "x"], r"levels\.1`: expected a number"),
-        ("datasets.synbench.recipe.pairs_per_level", 10, "only 9 different deformations"),
+        (
+            "datasets.synbench.recipe",
+            {"control_percents": [5], "widths": [0.3], "pairs_per_level": 2},
+            "`pairs_per_level` is 2, but .* give only 1 different deformations; give one of them",
+        ),
+        ("datasets.synbench.pairs.split.by", "level", "'object' or 'deformation'"),
+        ("datasets.synbench.source", {"kind": "path", "folder": "x"}, "`unseen.folder` is needed"),
+        ("datasets.synbench.unseen.folder", "x", "`unseen.folder` is not used when"),
+        ("datasets.synbench.unseen.objects", 0, r"`datasets\.synbench\.unseen\.objects` is 0"),
+        ("datasets.liver_unseen", {}, "cannot be called 'liver_unseen'; the ending stands for"),
+        ("lambda_search.candidates", [1.0e-4], "holds the single value 0.0001, which nothing is"),
+        ("lambda_search.candidates", [1.0e-4, 1.0e-4], "`candidates` holds a value twice"),
+        ("lambda_search.extend", -1, r"`lambda_search\.extend` is -1"),
+        (
+            "evidence.choice.candidates",
+            [1.0e-4],
+            r"`evidence\.choice`: `candidates` holds the sing",
+        ),
+        ("evaluation.training_spread", 10, r"`evaluation\.training_spread` is 10"),
+        ("backbones.deftransnet.datasets", ["liver"], r"deftransnet\.datasets` names 'liver'"),
+        (
+            "backbones.robust_defreg.datasets",
+            ["deformedtissue"],
+            "backbone 'robust_defreg' on `lambda_search.dataset`, 'synbench', which is not under",
+        ),
+        (
+            "backbones.robust_defreg_geometric.datasets",
+            ["deformedtissue"],
+            "backbone 'robust_defreg_geometric' on `lambda_search.dataset`",
+        ),
+        (
+            "evidence.backbones.robust_defreg_pretrained.own_lambda",
+            True,
+            r"robust_defreg_pretrained\.own_lambda` cannot be set",
+        ),
         ("datasets.synbench.pairs.convention", "spehre", "'sphere', 'disc', 'lexicographic'"),
         ("datasets.synbench.pairs.split.train", 0.9, "add up to 1, found 1.2"),
         ("datasets.synbench.source.kind", "path", "`folder` is needed when `kind` is path"),
@@ -158,7 +196,7 @@ def test_every_seed_trains_what_the_config_says():
     }
     every = {0, 5, 7}
     assert seeds == dict.fromkeys(seeds, every) | {"flow": {0}}
-    assert {c.dataset for c in cells if c.backbone == "robust_defreg_default"} == {"synbench"}
+    assert {c.dataset for c in cells if c.backbone == "robust_defreg_geometric"} == {"synbench"}
     # Without a backbone there is nothing to train, so there is one seed.
     cpd = [c for c in cells if c.method == "cpd"]
     assert [(c.dataset, c.backbone, c.seed) for c in cpd] == [
@@ -179,21 +217,24 @@ def test_what_is_taken_away_is_forgotten_by_the_evidence():
     change = {
         "datasets": {"deformedtissue": None},
         "priors": {"pca": None, "smoothness": None},
-        "backbones": {"robust_defreg": {"priors": []}, "deftransnet": None},
+        "backbones": {
+            **{"robust_defreg": {"priors": []}, "robust_defreg_geometric": {"priors": []}},
+            "deftransnet": None,
+        },
         "lambda_search": {"priors": ["flow"]},
     }
     loaded = config.validate(config.merge(DEFAULT, change))
     evidence = loaded.evidence
     assert "smoothness" not in evidence.methods
     assert "map_pca" not in evidence.methods
-    assert evidence.backbones["robust_defreg_default"].priors == []
+    assert evidence.backbones["robust_defreg_pretrained"].priors == []
     assert {cell.dataset for cell in evidence_cells(loaded)} == {"synbench"}
     without = config.merge(
         DEFAULT, {"datasets": {"synbench": None}, "lambda_search": {"dataset": "deformedtissue"}}
     )
     loaded = config.validate(without)
     # Both are for that dataset alone.
-    assert "robust_defreg_default" not in loaded.evidence.backbones
+    assert "robust_defreg_geometric" not in loaded.backbones
     assert "latent_flow" not in loaded.evidence.methods
 
 
@@ -253,3 +294,98 @@ def test_folders_of_seeds_go_there_and_back():
 def test_faults_of_methods_are_named(methods, match):
     with pytest.raises(ConfigError, match=match):
         with_evidence(methods=methods)
+
+
+# --- known and unseen objects, and searches of λ --------------------------------------------------
+
+
+def test_recipes_may_go_beyond_their_lists():
+    recipe = {"control_percents": [5], "widths": [0.3, 0.5], "pairs_per_level": 500}
+    assert config.validate_section(config.Recipe, recipe, "recipe").pairs_per_level == 500
+    assert config.most_pairs_per_level([5, 5], [0.3]) == 1
+    assert config.most_pairs_per_level([5, 6], [0.3]) == float("inf")
+
+
+def test_a_single_value_of_lambda_needs_no_search():
+    choice = {"candidates": [1.0e-4], "extend": 0}
+    assert config.validate(changed("lambda_search", choice)).lambda_search.candidates == [1.0e-4]
+
+
+def test_backbones_may_be_for_some_datasets():
+    loaded = config.load(ROOT / "config.yaml")
+    assert loaded.backbones_of("deformedtissue") == ["robust_defreg", "deftransnet"]
+    assert loaded.backbones_of("synbench") == list(loaded.backbones)
+    places = {(dataset, backbone) for dataset, backbone, _ in runs(loaded)}
+    assert len(places) == 5
+    assert ("deformedtissue", "robust_defreg_geometric") not in places
+    assert "histogram_synbench_robust_defreg_geometric" in figure_names(loaded)
+    assert "histogram_deformedtissue_robust_defreg_geometric" not in figure_names(loaded)
+    only = {name: {"datasets": ["synbench"]} for name in loaded.backbones}
+    with pytest.raises(ConfigError, match="no backbone is trained on the dataset 'deformedtissue'"):
+        config.validate(changed("backbones", only))
+
+
+def test_each_search_is_for_the_priors_that_it_counts_for():
+    loaded = config.load(ROOT / "config.yaml")
+    assert loaded.searched("robust_defreg") == ["pca", "pca_residual", "flow"]
+    # The first one is searched whatever is used, as its λ is that of all others.
+    values = changed("lambda_search.priors", ["flow", "pca_residual", "pca"])
+    geometric = config.validate(values).searched("robust_defreg_geometric")
+    assert geometric == ["flow", "pca_residual", "pca"]
+    values = changed("backbones.robust_defreg_geometric.priors", ["pca_residual"])
+    assert config.validate(values).searched("robust_defreg_geometric") == ["pca", "pca_residual"]
+    assert loaded.searching("deftransnet") == "robust_defreg"
+    assert loaded.searching("robust_defreg_geometric") == "robust_defreg_geometric"
+    assert own_searches(loaded) == ["robust_defreg_geometric"]
+    assert "lambda_robust_defreg_geometric" in figure_names(loaded)
+
+
+def tables_of(**changes):
+    """Names of the tables of SynBench's unseen objects, after changes of that dataset."""
+    found = table_names(config.validate(changed("datasets.synbench", changes)))
+    return [name for name in found if name.endswith("synbench_unseen")]
+
+
+def test_tables_of_unseen_objects_are_expected_where_they_are_sure():
+    three = ["deformation", "correspondence", "gains"]
+    assert tables_of() == [f"{name}_synbench_unseen" for name in three]
+    assert tables_of(unseen=None) == []
+    # All test pairs are of unseen objects then, and stand under the dataset's own name.
+    assert tables_of(pairs={"split": {"by": "object"}}) == []
+    # A published split decides, if there is one.
+    folders = {"source": {"kind": "path", "folder": "x"}, "unseen": {"folder": "y"}}
+    assert tables_of(**folders) == []
+    # Without a number of pairs, those of unseen objects are corrupted, too.
+    more = ["deformation", "corruption", "observed", "correspondence", "gains"]
+    assert tables_of(corruption={"pairs": None}) == [f"{name}_synbench_unseen" for name in more]
+
+
+def test_gains_are_expected_of_datasets_whose_backbones_have_priors():
+    backbones = {
+        "robust_defreg": {"priors": []},
+        "deftransnet": {"priors": [], "datasets": ["deformedtissue"]},
+    }
+    loaded = config.validate(changed("backbones", backbones))
+    assert "gains_synbench" in table_names(loaded)
+    assert "gains_deformedtissue" not in table_names(loaded)
+
+
+def test_conditions_hold_targets_of_other_points():
+    loaded = config.load(ROOT / "config.yaml")
+    assert conditions(loaded, "synbench") == [("resampled", 1.0)]
+    assert [name for name, _ in conditions(loaded, "deformedtissue")] == [
+        *["noise"] * 3,
+        *["outliers"] * 3,
+        "resampled",
+    ]
+    # No figure is drawn over a condition of one strength.
+    assert strengths(loaded, "synbench") == []
+    assert strengths(loaded, "deformedtissue") == ["noise", "outliers"]
+    plain = config.validate(changed("datasets.synbench.corruption.resampled", False))
+    assert conditions(plain, "synbench") == []
+
+
+def test_the_evidence_may_show_priors_that_no_backbone_has():
+    backbones = {name: {"priors": ["pca"]} for name in DEFAULT["backbones"]}
+    loaded = config.validate(changed("backbones", backbones))
+    assert "pca_residual" in loaded.evidence.examples

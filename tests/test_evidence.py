@@ -79,6 +79,8 @@ def made_up(effects=None, *, datasets=DATASETS, backbones=BACKBONES, seeds=3, co
                                         **{"method": method, "seed": seed, "origin": "synthetic"},
                                         "pair": [f"{level}-{i:03d}" for i in range(OBJECTS)],
                                         "object": [f"{i:03d}" for i in range(OBJECTS)],
+                                        "objects": "unseen",
+                                        "cluster": [f"{i:03d}" for i in range(OBJECTS)],
                                         **{"level": level, "condition": condition},
                                         **{"corruption": corruption, "cd": mce**2, "mce": mce},
                                         **{"hd95": 2 * mce, "accuracy_2_5": 0.5},

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from dine.errors import DataError
 from dine.reporting import figures, html, tables
+from dine.reporting.effects import effects, headlines, overview
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
@@ -50,9 +51,12 @@ def made_up(gain, **changes):
             "dataset": "deformedtissue",
             "backbone": "robust_defreg",
             "method": method,
+            "seed": 0,
             "origin": "synthetic",
             "pair": f"{level}-{pair}",
             "object": "made-up",
+            "objects": "known",
+            "cluster": f"made-up/{pair}",
             "level": level,
             "condition": condition,
             "corruption": corruption,
@@ -166,39 +170,87 @@ def test_names_are_escaped(tmp_path):
     assert "paper" not in words.partition("Tables")[2]
 
 
+# ------------------------------------------------------------------------------------ effects
+
+
+def even(gain, *, method="pca", **changes):
+    """As ``made_up``, with pairs that are all alike: only the training is left to chance."""
+    metrics = made_up(gain).replace({"method": {"pca": method}})
+    scale = {"stage1": 20e-4, "lambda0": 16e-4, method: 16e-4 * (1 - gain)}
+    return metrics.assign(
+        cd=metrics["method"].map(scale), mce=metrics["method"].map(scale), **changes
+    )
+
+
 @pytest.mark.parametrize(
-    ("gain", "levels", "noise"),
+    ("gain", "spread", "said"),
     [
-        (0.25, "2 of 2 deformation levels (median: 25.0 % lower)", "1 of 1"),
-        (-0.5, "0 of 2 deformation levels (median: 50.0 % higher)", "0 of 1"),
+        (0.25, 0.0, "lower on DeformedTissue with Robust-DefReg: −25 % (−25 to −25)."),
+        (0.25, 0.1, "lower on DeformedTissue with Robust-DefReg: −25 % (−45 to −5)."),
+        (0.25, 0.2, "undecided on DeformedTissue with Robust-DefReg: −25 % (−64 to +14)."),
+        (-0.5, 0.0, "higher on DeformedTissue with Robust-DefReg: +50 % (+50 to +50)."),
     ],
 )
-def test_findings_follow_the_numbers(gain, levels, noise):
-    control, stage1 = html.findings(made_up(gain))
-    assert control == (
-        "DeformedTissue (synthetic data), Robust-DefReg: DINE-PCA has a lower mean CD than the "
-        f"control at {levels} and {noise} noise and outlier settings "
-        f"(median: {levels.partition('median: ')[2]}."
-    )
-    after = 20 * (1 - gain) * 0.8
-    word = "lower" if after < 20 else "higher"
-    assert f"than Stage 1 at {'2 of 2' if after < 20 else '0 of 2'}" in stage1
-    assert f"{abs(100 * (1 - after / 20)):.1f} % {word}" in stage1
+def test_headlines_say_what_the_interval_allows(gain, spread, said):
+    control, stage1 = headlines(even(gain), spread=spread)
+    start = "Known objects (synthetic data), DINE-PCA against "
+    assert control == f"{start}the control, mean Chamfer distance: {said}"
+    assert stage1.startswith(f"{start}Stage 1, mean Chamfer distance: ")
 
 
-def test_findings_without_control_or_prior():
-    metrics = made_up(0.25)
-    control, stage1 = html.findings(metrics[metrics["method"] != "lambda0"])
-    assert "the control was not evaluated on the same pairs" in control
-    assert "2 of 2 deformation levels (median: 40.0 % lower)" in stage1
-    (nothing,) = html.findings(metrics[metrics["method"] != "pca"])
+def test_known_objects_come_first_and_each_prior_has_a_sentence():
+    unseen = even(-0.5, objects="unseen", dataset="deformedtissue_unseen")
+    other = even(0.25, method="flow", backbone="deftransnet")
+    found = headlines(pd.concat([unseen, other, even(0.25)]))
+    beginnings = [" ".join(sentence.split()[:6]) for sentence in found]
+    assert beginnings == [
+        *["Known objects (synthetic data), DINE-PCA against"],
+        *["Known objects (synthetic data), DINE-Flow against"],
+        *["Known objects (synthetic data), DINE-PCA against"],
+        *["Known objects (synthetic data), DINE-Flow against"],
+        *["Unseen objects (synthetic data), DINE-PCA against"] * 2,
+    ]
+    assert "higher on DeformedTissue with Robust-DefReg: +50 %" in found[-2]
+
+
+def test_strengths_of_a_condition_are_one_effect_of_pairs_drawn_together():
+    noise = even(0.25)
+    noise = noise[noise["condition"] == "noise"]
+    found = effects(pd.concat([noise, noise.assign(corruption=0.05)]))
+    assert found[["condition", "pairs", "clusters", "relative"]].round(6).to_numpy().tolist() == [
+        ["noise", 12, 3, -25]
+    ]
+
+
+def test_headlines_without_control_or_prior():
+    metrics = even(0.25)
+    (stage1,) = headlines(metrics[metrics["method"] != "lambda0"])
+    assert "DINE-PCA against Stage 1" in stage1
+    (nothing,) = headlines(metrics[metrics["method"] != "pca"])
     assert nothing.startswith("No prior was evaluated")
 
 
-def test_overview_shows_losses_with_a_sign(tmp_path):
-    words = Page(report(tmp_path, made_up(-0.5))).words
-    assert "Deformation levels 0 of 2: −50.0 % (−50.0 to −50.0) 0 of 2: −20.0 %" in words
-    assert "2 of 2: 20.0 % (20.0 to 20.0)" in words
+def test_overview_has_a_column_for_every_condition():
+    header, rows = overview(even(-0.5))
+    assert header == [
+        *("Objects", "Dataset", "Backbone", "Prior", "CD, deformation", "CD, noise"),
+        *("MCE, deformation", "CD, deformation, against Stage 1"),
+    ]
+    assert rows == [
+        [
+            *("Known objects", "DeformedTissue", "Robust-DefReg", "DINE-PCA"),
+            *["higher: +50 % (+50 to +50)"] * 3,
+            "higher: +20 % (+20 to +20)",
+        ]
+    ]
+
+
+def test_the_page_shows_effects_their_chance_and_where_they_were_made(tmp_path):
+    words = Page(report(tmp_path, even(-0.5), spread=0.05, made={"CPU": "a <chip>"})).words
+    assert "higher: +50 % (+40 to +60)" in words
+    assert "varies by 5 % of the reference" in words
+    assert "What Value CPU a <chip>" in words
+    assert "varies by" not in Page(report(tmp_path, even(-0.5))).words
 
 
 @pytest.mark.parametrize("address", ["https://example.org/x.csv", "//example.org", "/etc/x"])

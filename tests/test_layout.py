@@ -352,6 +352,51 @@ def test_split_lists_with_pair_names(make):
     assert found.split_file == folder / "splits/test.txt"
 
 
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("split.json", '{"train": ["0.1/1_5_0.3"], "test": ["0.2/1_5_0.3"]}'),
+        ("split.json", '{"0.1/1_5_0.3": "train", "0.2/Target_1_5_0.3": "test"}'),
+        (
+            "split.json",
+            json.dumps(
+                {
+                    "train": ["Deformation_Level/0.1/Source_1_5_0.3.ply"],
+                    "test": ["elsewhere\\dataset\\Deformation_Level\\0.2\\Target_1_5_0.3.ply"],
+                }
+            ),
+        ),
+        ("split.csv", "level,name,split\n0.1,1_5_0.3,train\n0.2,1_5_0.3,test\n"),
+    ],
+)
+def test_split_files_tell_pairs_of_one_name_apart_by_level(make, file, text):
+    folder = make(*pair("Deformation_Level/0.1"), *pair("Deformation_Level/0.2"), file)
+    (folder / file).write_text(text)
+    found = scan(folder)
+    assert found.split == {"0.1/1_5_0.3": "train", "0.2/1_5_0.3": "test"}
+    assert {files.id for files in found.pairs} == set(found.split)
+
+
+def test_a_level_may_be_missing_in_a_split_file(make):
+    folder = make(*pair("0.1"), *pair("0.2", "2_5_0.3"), "split.csv")
+    (folder / "split.csv").write_text("level,name,split\n0.1,1_5_0.3,train\n,2_5_0.3,test\n")
+    assert scan(folder).split == {"0.1/1_5_0.3": "train", "2_5_0.3": "test"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"train": ["1_5_0.3"], "test": ["1_5_0.3"]}', "in train and in test .*by their level"),
+        ('{"train": ["0.9/1_5_0.3"]}', "names none of the objects and pairs found"),
+    ],
+)
+def test_splits_that_tell_pairs_wrongly(make, text, message):
+    folder = make(*pair("0.1"), *pair("0.2"), "split.json")
+    (folder / "split.json").write_text(text)
+    with pytest.raises(DataError, match=message):
+        scan(folder)
+
+
 def test_one_of_several_split_files_is_used(make):
     folder = make("1.ply", "split.json", "sub/split.json", "train.txt", "a/b/split.json")
     (folder / "split.json").write_text('{"1": "test"}')

@@ -177,13 +177,19 @@ def test_columns_keep_their_names_and_order(tmp_path, stored):
     found = run(tmp_path, [prediction], seed=3)
     assert found["seed"].tolist() == [3] * 3
     columns = found.columns.tolist()
-    assert columns.pop(columns.index("method") + 1) == "seed"
     assert columns[: len(COLUMNS)] == COLUMNS
     assert columns[len(COLUMNS) :] == [
         *("cd_unsquared", "hd95", "hausdorff", "mce_median", "mce_p95", "accuracy_2_5"),
         *("accuracy_5", "far_points", "folding", "roughness", "roughness_true", "mce_original"),
         "seconds",
     ]
+
+
+def test_rows_say_whether_their_object_is_known_and_what_is_drawn_together(tmp_path, stored):
+    fields = np.zeros((3, POINTS, 3), np.float32)
+    found = run(tmp_path, [Prediction("deformation", 0.0, stored.name, fields)])
+    assert found["objects"].tolist() == ["unseen"] * 3
+    assert found["cluster"].astype(str).tolist() == ["0", "1", "2"]
 
 
 def test_every_column_of_a_row_against_naive_computations(tmp_path, stored):
@@ -315,15 +321,17 @@ def test_resampled_rows_break_no_table(tmp_path, stored):
         files.append((tmp_path / "m.csv").rename(tmp_path / f"{method}.csv"))
     metrics = load_metrics(files)
     made = {table.name: table for table in all_tables(metrics)}
-    assert set(made) == {"table2", "gains_synbench", "correspondence_synbench"}
+    more = ["corruption_synbench", "gains_synbench", "observed_synbench"]
+    more += ["correspondence_synbench"]
+    assert set(made) == {"table2", *more}
     paper = made["table2"].data
     assert set(paper["condition"]) == {"deformation"}
-    for name in ("gains_synbench", "correspondence_synbench"):
+    for name in more:
         labels = [[cell.text for cell in row] for row in made[name].rows]
-        assert any("Resampled target" in row for row in labels)
+        assert any("Other points" in row for row in labels)
     alone = metrics[metrics["condition"] == "resampled"]
     names = [table.name for table in all_tables(alone)]
-    assert names == ["gains_synbench", "correspondence_synbench"]
+    assert names == more
     for table in made.values():
         assert to_markdown(table)
         assert to_latex(table)

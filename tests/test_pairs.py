@@ -15,6 +15,7 @@ from dine.data.corruption import make_variant
 from dine.data.layout import Inventory, PairFiles
 from dine.data.pairs import (
     PairSet,
+    evaluated_pairs,
     read_pairs,
     read_variant,
     write_pairs,
@@ -400,6 +401,110 @@ def test_published_split_that_fits_nothing(inventory):
     split = {"elsewhere": "train"}
     with pytest.raises(DataError, match=r"no usable pair.*names neither"):
         make(Inventory(inventory.folder, pairs=inventory.pairs, split=split))
+
+
+# --- splits by deformation --------------------------------------------------------------------
+
+BY_DEFORMATION = {"by": "deformation", "split": {"train": 0.5, "val": 0.25, "test": 0.25}}
+
+
+def renamed(inventory, names):
+    """The pairs of one object, called as given; each name stands for one deformation."""
+    pairs = [
+        replace(inventory.pairs[i % 2], name=name, level=level)
+        for i, (level, name) in enumerate(names)
+    ]
+    return Inventory(inventory.folder, pairs=pairs)
+
+
+def test_every_object_and_level_is_in_every_part_of_a_split_by_deformation(inventory):
+    made = renamed(inventory, [(x, f"0_{x}_{i}") for x in (0.2, 0.4) for i in range(8)])
+    other = [replace(p, object="1", name=f"1{p.name[1:]}") for p in made.pairs]
+    pairs, _ = make(Inventory(inventory.folder, pairs=[*made.pairs, *other]), **BY_DEFORMATION)
+    for name in "01":
+        for level in (0.2, 0.4):
+            here = pairs.split[(pairs.object == name) & (pairs.level == level)].tolist()
+            assert [here.count(part) for part in ("train", "val", "test")] == [4, 2, 2]
+    assert pairs.attributes["split_rule"] == "deformations"
+    assert pairs.known.all()
+
+
+def test_one_deformation_at_several_levels_stays_together(inventory):
+    made = renamed(inventory, [(x, f"0_{i}_1") for x in (0.2, 0.4) for i in range(4)])
+    parts = defaultdict(set)
+    for seed in range(3):
+        pairs, _ = make(made, seed=seed, **BY_DEFORMATION)
+        here = defaultdict(set)
+        for name, part in zip(pairs.name.tolist(), pairs.split.tolist(), strict=True):
+            here[name.split("/")[1]].add(part)
+        assert sorted(map(min, here.values())) == ["test", "train", "train", "val"]
+        assert all(len(where) == 1 for where in here.values())
+        parts[str(sorted(here.items()))].add(seed)
+    assert len(parts) > 1  # the seed shuffles
+
+
+def test_levels_are_shared_by_hand():
+    share = {"train": 0.5, "test": 0.5}
+    # Both parts lack one pair of either level; the object's balance decides, then the level's.
+    assert making._share_levels([[1], [2], [1], [2]], share) == ["train", "test", "test", "train"]
+    # What is left must go where nothing is yet.
+    assert making._share_levels([[1], [2]], {"train": 0.9, "test": 0.1}) == ["train", "test"]
+
+
+def test_too_few_deformations_for_the_splits(inventory):
+    made = renamed(inventory, [(0.2, "0_1_1"), (0.4, "0_1_1"), (0.2, "0_2_1")])
+    with pytest.raises(DataError, match=r"needs at least 3 deformations .*, found 2 of '0'; prov"):
+        make(made, **BY_DEFORMATION)
+
+
+def test_published_splits_get_validation_pairs_where_objects_are_known(inventory):
+    made = renamed(inventory, [(0.2, f"0_{i}_1") for i in range(6)])
+    made.split = {f"0.2/0_{i}_1": "test" if i > 3 else "train" for i in range(6)}
+    pairs, _ = make(made)
+    parts = pairs.split.tolist()
+    # Shares 0.6 and 0.2 of four deformations: three and one.
+    assert [parts.count(part) for part in ("train", "val", "test")] == [3, 1, 2]
+    # One object that is not tested on cannot be shared out alone.
+    alone = [replace(p, object="1", name=f"1{p.name[1:]}") for p in made.pairs[:2]]
+    both = Inventory(made.folder, pairs=[*made.pairs, *alone], split=made.split | {"1": "train"})
+    parts = make(both)[0].split.tolist()
+    assert (parts.count("test"), "val" in parts) == (2, True)
+
+
+def test_known_objects_and_clusters(pairs):
+    split = np.where(pairs.object == "0", "test", pairs.split)
+    split[np.flatnonzero(pairs.object == "0")[0]] = "train"
+    some = replace(pairs, split=split)
+    assert some.known[pairs.object == "0"].all()
+    clusters = some.cluster
+    # Both levels of a known object's deformation are one cluster.
+    assert set(clusters[pairs.object == "0"]) == {"0/0_5_0.3"}
+    unknown = ~some.known
+    assert unknown.any()
+    np.testing.assert_array_equal(clusters[unknown], pairs.object[unknown])
+
+
+def test_evaluated_pairs_are_spread_over_levels_and_of_known_objects(pairs):
+    names = [f"{0.2 if i < 6 else 0.4}/{i}" for i in range(10)]
+    some = replace(
+        pairs,
+        name=np.array(names),
+        level=np.repeat([0.2, 0.4], [6, 4]),
+        object=np.array(["a"] * 9 + ["b"]),
+        split=np.array(["train", *["test"] * 9]),
+    )
+    assert len(evaluated_pairs(some)) == 9
+    found = evaluated_pairs(some, most=6)
+    assert found.level.tolist() == [0.2] * 3 + [0.4] * 3
+    assert "b" not in found.object
+    # More are the same and others; all is the limit.
+    assert set(found.name) < set(evaluated_pairs(some, most=7).name)
+    assert len(evaluated_pairs(some, most=100)) == 8
+    assert set(evaluated_pairs(some, [0.4], most=2).level) == {0.4}
+    unknown = replace(some, split=np.full(10, "test"))
+    assert len(evaluated_pairs(unknown, most=100)) == 10
+    with pytest.raises(DataError, match=r"no pairs of the levels 0\.3"):
+        evaluated_pairs(some, [0.3], most=2)
 
 
 # --- the type ---------------------------------------------------------------------------------

@@ -3,7 +3,9 @@
 import os
 import re
 import shutil
+import subprocess
 import sys
+from datetime import datetime, timedelta
 from importlib import resources
 
 import click
@@ -169,6 +171,50 @@ def test_signature_of_a_manifest_sees_the_files_that_it_lists(tmp_path):
 
 def test_versions_name_what_results_depend_on():
     assert {"dine", "python", "torch", "numpy", "numba"} <= set(versions())
+
+
+def test_records_say_on_what_of_which_commit_when_and_how(monkeypatch):
+    for name in (*provenance.CPU_SETTINGS, provenance.COMMAND):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/dine", "stage1", "--out", "a folder"])
+    found = provenance.made()
+    assert found["CPU"].endswith(f", {os.cpu_count()} threads")
+    assert found["command"] == "dine stage1 --out 'a folder'"
+    assert datetime.fromisoformat(found["date"]).utcoffset() == timedelta(0)
+    assert "CPU settings" not in found
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
+    monkeypatch.setenv(provenance.COMMAND, "snakemake -j2 all")
+    record = provenance.run_record({"steps": 1}, 5)
+    assert record["made"]["command"] == "snakemake -j2 all"
+    assert record["made"]["CPU settings"] == "ATEN_CPU_CAPABILITY=avx2 OMP_NUM_THREADS=3"
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ("none", r"[0-9a-f]{40}"),
+        ("some", r"[0-9a-f]{40} with changes"),
+        ("damage", r"unknown \(git cannot be asked\)"),
+        ("package", r"none \(installed package, version .*\)"),
+    ],
+)
+def test_the_commit_is_that_of_the_checkout(tmp_path, monkeypatch, changes, expected):
+    def git(*arguments):
+        who = ("-c", "user.name=a", "-c", "user.email=a@b")
+        subprocess.run(["git", "-C", tmp_path, *who, *arguments], check=True)
+
+    (tmp_path / "file").write_text("1")
+    if changes == "damage":
+        (tmp_path / ".git").write_text("gitdir: /nowhere")
+    elif changes != "package":
+        git("init", "--quiet")
+        git("add", "file")
+        git("commit", "--quiet", "--message", "first")
+    if changes == "some":
+        (tmp_path / "file").write_text("2")
+    monkeypatch.setattr(provenance, "PACKAGE", tmp_path / "dine")
+    assert re.fullmatch(expected, provenance._commit.__wrapped__())
 
 
 @pytest.mark.parametrize("name", ["robust_defreg", "deftransnet"])

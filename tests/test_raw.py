@@ -10,7 +10,7 @@ from dine.data.layout import Inventory, scan
 from dine.data.raw import deform_bases, synthesise, write_dataset
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
-from dine.errors import DataError, StorageError
+from dine.errors import ConfigError, DataError, StorageError
 from dine.files import read_json
 
 RECIPE = {
@@ -281,7 +281,7 @@ def test_no_usable_mesh_is_an_error_that_says_why(tmp_path):
         ({"widths": [0.3, 0.30000001]}, "widths"),
         ({"widths": [-1]}, "width"),
         ({"control_percents": [0]}, "control_percent"),
-        ({"pairs_per_level": 5}, "pairs_per_level"),
+        ({"pairs_per_level": 2, "control_percents": [5], "widths": [0.3]}, "pairs_per_level"),
         ({"pairs_per_level": 0}, "pairs_per_level"),
         ({"points": 0}, "points"),
     ],
@@ -290,6 +290,38 @@ def test_bad_parameters_are_named_before_anything_is_written(tmp_path, change, m
     with pytest.raises(ValueError, match=f"^{message} must"):
         write(tmp_path / "d", [("a", ball())], **change)
     assert not list(tmp_path.iterdir())
+
+
+def test_pairs_beyond_the_lists_are_drawn_from_the_ranges_that_they_span(tmp_path):
+    lists = {"levels": [0.1], "control_percents": [2, 10], "widths": [0.3]}
+    write(tmp_path / "few", [("a", ball())], **lists)
+    write(tmp_path / "many", [("a", ball())], **lists | {"pairs_per_level": 30})
+    few, many = contents(tmp_path / "few"), contents(tmp_path / "many")
+    # The combinations of the lists come first, and are what they were.
+    assert few.items() < many.items()
+    found = scan(tmp_path / "many").pairs
+    percents = [pair.control_percent for pair in found]
+    assert len(set(percents)) == 30
+    assert {2, 10} < set(percents)
+    assert (min(percents), max(percents)) == (2, 10)
+    assert 4 < np.mean(percents) < 8
+    # One list has no range.
+    assert {pair.width for pair in found} == {0.3}
+
+
+def test_what_is_drawn_is_what_the_name_says(tmp_path):
+    write(tmp_path / "d", [("a", ball())], levels=[0.1], pairs_per_level=6)
+    drawn = raw._kernels(RECIPE | {"pairs_per_level": 6}, 0, "a", "0.1")
+    named = {(pair.control_percent, pair.width) for pair in scan(tmp_path / "d").pairs}
+    assert named == set(drawn)
+    assert sorted(drawn[:4]) == [(2, 0.3), (2, 0.5), (10, 0.3), (10, 0.5)]
+
+
+def test_ranges_too_narrow_for_the_pairs_are_refused(tmp_path):
+    near = {"control_percents": [5], "widths": [0.3, 0.3001], "pairs_per_level": 3}
+    with pytest.raises(ConfigError, match=r"is 3, but .* so close .* only 2 different deform"):
+        write(tmp_path / "d", [("a", ball())], **near)
+    assert not (tmp_path / "d").exists()
 
 
 def test_bad_requests_for_synthesis(tmp_path):

@@ -17,19 +17,21 @@ import torch
 from commands import STAGE1, STAGE2, dine
 
 from dine import cli, config
+from dine.config import LambdaSearch, Stage2
 from dine.data.batch import make_batch
 from dine.data.fields import read_fields
 from dine.data.obtain import obtain
 from dine.data.pairs import read_pairs, read_seen, read_variant, write_pairs
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.evaluation.quality import chamfer
-from dine.files import read_json
+from dine.files import read_json, write_json
 from dine.models.inference import predict_fields
 from dine.models.state import one_writer
 from dine.priors import FlowPrior, load_prior
 from dine.training import stages
 from dine.training.data_terms import DATA_TERMS
-from dine.training.stage2 import selected_lambda
+from dine.training.loop import VALIDATION_COLUMNS
+from dine.training.stage2 import beyond_the_edge, search_lambda, selected_lambda
 
 
 def test_stage1_writes_weights_history_and_record(chain):
@@ -67,6 +69,56 @@ def test_lambda_is_the_best_candidate_on_validation_pairs(chain):
     assert selected_lambda(chain / "lambda.json", "pca") == result["selected"]["pca"]
     # A prior without a search of its own takes the default's.
     assert selected_lambda(chain / "lambda.json", "flow") == result["selected"]["pca"]
+
+
+def test_how_random_weights_start_is_no_matter_where_weights_are_given():
+    given = stages.starting_backbone("robust_defreg", {}, "pretrained", 0)
+    other = "default" if given.arguments["initialisation"] == "geometric" else "geometric"
+    same = stages.starting_backbone("robust_defreg", {"initialisation": other}, "pretrained", 0)
+    assert all(map(torch.equal, given.state_dict().values(), same.state_dict().values()))
+    with pytest.raises(CheckpointError, match="the configuration asks for"):
+        stages.starting_backbone("robust_defreg", {"candidates": 7}, "pretrained", 0)
+
+
+@pytest.mark.parametrize(
+    ("tried", "expected"),
+    [
+        ({1e-4: 3, 1e-3: 2, 1e-2: 1}, 0.1),
+        ({1e-4: 1, 1e-3: 2, 1e-2: 3}, 1e-5),
+        ({1e-2: 3, 1e-4: 2, 1e-3: 1}, None),
+        ({1e-4: 3, 1e-3: 2, 5e-3: 1}, 0.025),
+        ({1e-4: 1}, None),
+    ],
+)
+def test_the_grid_goes_on_as_its_last_steps(tried, expected):
+    assert beyond_the_edge(tried) == expected
+
+
+@pytest.mark.parametrize(
+    ("best", "extend", "tried", "selected"),
+    [
+        (1.0, 0, [1e-3, 1e-2], 1e-2),
+        (1.0, 1, [1e-3, 1e-2, 1e-1], 1e-1),
+        (0.1, 3, [1e-3, 1e-2, 1e-1, 1], 1e-1),
+        (1e-5, 2, [1e-5, 1e-4, 1e-3, 1e-2], 1e-5),
+    ],
+)
+def test_a_search_goes_on_until_the_best_lies_inside(
+    tmp_path, monkeypatch, best, extend, tried, selected
+):
+    def stage2(*_, weight, out, **__):
+        # How far λ is from the best, in steps; the control is beyond all.
+        error = abs(np.log10(weight / best)) if weight else 99.0
+        out.mkdir(parents=True)
+        write_json(out / "run.json", {"final": dict.fromkeys(VALIDATION_COLUMNS, error)})
+
+    monkeypatch.setattr("dine.training.stage2.stage2", stage2)
+    search = LambdaSearch(candidates=[1e-2, 1e-3], extend=extend)
+    out = tmp_path / "lambda.json"
+    search_lambda(out, out, {"pca": out}, Stage2(), search, seed=0, out=out)
+    result = read_json(out)
+    assert [row["lambda"] for row in result["curve"]] == [0, *tried]
+    assert result["selected"] == {"pca": selected}
 
 
 def run_stage2(chain, out, *arguments):

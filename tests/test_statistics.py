@@ -17,6 +17,7 @@ from dine.evaluation.statistics import (
     paired,
     rank_biserial,
     summary,
+    verdicts,
     wilcoxon,
 )
 
@@ -31,6 +32,7 @@ def rows(method, mce, *, seed=0, levels=(0.5,), per_object=1, **changes):
                 {
                     **{"dataset": "d", "backbone": "b", "method": method, "seed": seed},
                     **{"pair": f"{level}/{i}", "object": str(i // per_object), "level": level},
+                    "cluster": str(i // per_object),
                     **{"condition": "deformation", "corruption": 0.0},
                     **{"cd": value**2, "mce": value, "hd95": 2 * value},
                     **{"accuracy_2_5": 0.5, "accuracy_5": 0.75, "far_points": 0.25},
@@ -294,6 +296,11 @@ def test_compare_against_naive_computations():
     every = only(table, level=np.nan, value="mce")
     assert every["p"] == every["p_holm"] == pytest.approx(wilcoxon((new - old).ravel()))
     assert (every["pairs"], every["objects"]) == (60, 5)
+    apart = compare(metrics.assign(cluster=metrics["pair"]), "new", "old", values=["mce"])
+    row = only(apart, level=0.2)
+    assert (row["objects"], row["clusters"]) == (5, 20)
+    expected = cluster_bootstrap(new[0] - old[0], [f"0.2/{i}" for i in range(20)])
+    assert (row["ci_low"], row["ci_high"]) == pytest.approx(expected)
     squared = only(table, level=0.2, value="cd")
     assert squared["difference"] == pytest.approx((new[0] ** 2 - old[0] ** 2).mean())
 
@@ -338,6 +345,55 @@ def test_pairs_of_unknown_level_count_in_the_row_of_all():
     table = compare(metrics, "new", "old", values=["mce"])
     assert len(table) == 1
     assert table["pairs"].tolist() == [2]
+
+
+# ----------------------------------------------------------------------------------- verdicts
+
+
+def two_objects(seeds=1):
+    """Differences −0.1 and −0.02 of two objects to 0.2: −30 %, from −50 to −10."""
+    return pd.concat(
+        rows(method, mce, seed=seed, per_object=2)
+        for seed in range(seeds)
+        for method, mce in (("new", [0.1, 0.1, 0.18, 0.18]), ("old", [0.2] * 4))
+    )
+
+
+@pytest.mark.parametrize(
+    ("spread", "seeds", "half", "verdict"),
+    [
+        (0.0, 1, 20, "lower"),
+        (0.1, 1, np.hypot(20, 19.6), "lower"),
+        (0.2, 1, np.hypot(20, 39.2), "undecided"),
+        (0.2, 4, np.hypot(20, 19.6), "lower"),
+    ],
+)
+def test_verdicts_join_the_chance_of_pairs_and_of_training(spread, seeds, half, verdict):
+    found = verdicts(two_objects(seeds), "old", "mce", spread=spread)
+    row = only(found, level=0.5)
+    assert (row["method"], row["pairs"], row["clusters"]) == ("new", 4, 2)
+    assert row["relative"] == pytest.approx(-30)
+    assert (row["low"], row["high"]) == pytest.approx((-30 - half, -30 + half))
+    assert row["verdict"] == verdict
+    assert len(found) == 2
+
+
+def test_verdicts_turn_with_the_reference_and_need_two_clusters():
+    turned = only(verdicts(two_objects(), "new", "mce"), level=0.5)
+    assert turned["verdict"] == "higher"
+    one = verdicts(two_objects().assign(cluster="0"), "old", "mce", spread=0.1)
+    assert set(one["verdict"]) == {"undecided"}
+    assert one["low"].isna().all()
+
+
+def test_verdicts_are_of_shared_pairs_and_need_the_reference():
+    metrics = two_objects()
+    part = metrics[metrics["method"] == "new"].iloc[2:].assign(method="part")
+    found = verdicts(pd.concat([metrics, part]), "old", "mce")
+    assert only(found, level=0.5, method="part")["pairs"] == 2
+    assert verdicts(metrics, "absent", "mce").empty
+    elsewhere = metrics[metrics["method"] == "new"].assign(backbone="c")
+    assert set(verdicts(pd.concat([metrics, elsewhere]), "old", "mce")["backbone"]) == {"b"}
 
 
 # ------------------------------------------------------------------------------------ summary

@@ -12,9 +12,12 @@ def row(method, pair, cd, **changes):
         "dataset": "deformedtissue",
         "backbone": "robust_defreg",
         "method": method,
+        "seed": 0,
         "origin": "synthetic",
         "pair": pair,
         "object": "made-up",
+        "objects": "known",
+        "cluster": f"made-up/{pair}",
         "level": 0.7,
         "condition": "deformation",
         "corruption": 0.0,
@@ -35,8 +38,8 @@ def metrics():
             row("stage1", "b", 22e-4),
             row("lambda0", "a", 10e-4),
             row("lambda0", "b", 20e-4),
-            row("pca", "a", 11e-4),
-            row("pca", "b", 5e-4),
+            row("pca", "a", 5e-4),
+            row("pca", "b", 11e-4),
         ]
     )
 
@@ -98,6 +101,8 @@ def test_missing_columns_are_named_with_the_file(tmp_path, metrics):
         ({"pair": None}, "column pair is empty"),
         ({"condition": "fog"}, "unknown condition 'fog'"),
         ({"origin": "moon"}, "unknown origin 'moon'"),
+        ({"objects": "lost"}, "unknown objects 'lost'"),
+        ({"cluster": None}, "column cluster is empty"),
     ],
 )
 def test_unusable_values_are_refused(tmp_path, changes, message):
@@ -161,6 +166,7 @@ def test_summary_pools_levels(metrics):
 
 
 def test_gains_are_paired_and_signed(metrics):
+    metrics.loc[metrics["method"] == "pca", "cd"] = [11e-4, 5e-4]
     # Pair c has no PCA result and must not count for any method.
     metrics = pd.concat(
         [metrics, pd.DataFrame([row("stage1", "c", 1.0), row("lambda0", "c", 1.0)])]
@@ -171,19 +177,27 @@ def test_gains_are_paired_and_signed(metrics):
     assert gain["gain_over_stage1"] == pytest.approx(60)
     assert gain["gain_over_lambda0"] == pytest.approx(100 * 7 / 15)
     assert gain["pairs_better_than_lambda0"] == pytest.approx(50)
+    # Of two pairs that differ by +1 and −15, in percent of 15, and as a reduction.
+    assert (gain["low"], gain["high"]) == pytest.approx((-100 / 15, 100))
+    assert gain["verdict"] == "undecided"
 
 
 def test_a_harmful_prior_has_a_negative_gain(metrics):
     metrics.loc[metrics["method"] == "pca", "cd"] = 30e-4
     table = tables.gain_table("deformedtissue", metrics)
     assert only(table.data, method="pca")["gain_over_lambda0_percent"] == pytest.approx(-100)
-    assert [cell.text for cell in table.rows[0]][-4:] == ["+25.0 %", "−50.0 %", "−100.0 %", "0 %"]
+    assert [cell.text for cell in table.rows[0]][-6:] == [
+        *("+25.0 %", "−50.0 %", "−100.0 %"),
+        *("−133 to −67 %", "higher", "0 %"),
+    ]
 
 
 def test_gains_without_control(metrics):
     gain = only(tables.gains(metrics[metrics["method"] != "lambda0"]), method="pca")
     assert gain["gain_over_stage1"] == pytest.approx(60)
     assert np.isnan(gain["gain_over_lambda0"])
+    cells = tables.gain_table("deformedtissue", metrics[metrics["method"] != "lambda0"]).rows[0]
+    assert [cell.text for cell in cells][-3:] == ["–", "–", "–"]
     assert tables.gains(metrics[metrics["method"] == "stage1"]).empty
 
 
@@ -237,19 +251,55 @@ def test_levels_outside_the_paper_appear(metrics):
     assert [line[0].text for line in table.rows[::2]][-2:] == ["0.7", "0.75"]
 
 
-def test_bold_is_the_lowest_within_each_backbone(metrics):
-    better = metrics.assign(backbone="deftransnet", cd=metrics["cd"] / 10)
-    better.loc[better["method"] == "pca", "cd"] = 50e-4
+def verdicts(data):
+    rows = data.loc[data["verdict"] != "", ["backbone", "method", "verdict"]]
+    return {tuple(row[:2]): row[2] for row in rows.itertuples(index=False)}
+
+
+def test_bold_is_what_is_decided_to_be_lower_than_the_control_of_its_backbone(metrics):
+    worse = metrics.assign(backbone="deftransnet", cd=metrics["cd"] / 10)
+    worse.loc[worse["method"] == "pca", "cd"] = 50e-4
     lone = metrics[metrics["method"] == "pca"].assign(backbone="lonely")
-    data = tables.paper_table(1, pd.concat([metrics, better, lone])).data
-    lowest = data.loc[data["lowest"], ["backbone", "method"]].to_numpy().tolist()
-    assert lowest == [["robust_defreg", "pca"], ["deftransnet", "lambda0"]]
+    table = tables.paper_table(1, pd.concat([metrics, worse, lone]))
+    assert verdicts(table.data) == {
+        ("robust_defreg", "stage1"): "higher",
+        ("robust_defreg", "pca"): "lower",
+        ("deftransnet", "stage1"): "higher",
+        ("deftransnet", "pca"): "higher",
+    }
+    assert [cell.text for line in table.rows for cell in line if cell.bold] == ["8.00 ± 4.24"]
 
 
-def test_equal_printed_means_are_both_bold(metrics):
-    metrics.loc[metrics["method"] == "lambda0", "cd"] = 8.001e-4
+def test_what_chance_explains_is_not_bold(metrics):
+    # −46.7 ± 13.3 % is decided, until trainings differ by 30 % (± 58.8 %).
+    bold = [
+        sum(cell.bold for line in tables.paper_table(1, metrics, spread).rows for cell in line)
+        for spread in (0.0, 0.3)
+    ]
+    assert bold == [1, 0]
+    metrics.loc[metrics["method"] == "pca", "cd"] = [11e-4, 5e-4]
     data = tables.paper_table(1, metrics).data
-    assert data.loc[data["lowest"], "method"].tolist() == ["lambda0", "pca"]
+    assert verdicts(data)["robust_defreg", "pca"] == "undecided"
+
+
+def test_unseen_objects_are_shown_as_a_dataset_of_their_own(tmp_path, metrics):
+    unseen = metrics.assign(pair="u" + metrics["pair"], objects="unseen", cluster="u")
+    path = write(tmp_path / "m.csv", pd.concat([metrics, unseen]))
+    loaded = tables.load_metrics([path])
+    kinds = loaded.groupby("dataset")["objects"].unique().map(list).to_dict()
+    assert kinds == {"deformedtissue": ["known"], "deformedtissue_unseen": ["unseen"]}
+    made = {table.name: table for table in tables.all_tables(loaded)}
+    assert {"table1", "deformation_deformedtissue_unseen", "gains_deformedtissue_unseen"} < set(
+        made
+    )
+    assert made["table1"].data["n"].max() == 2
+    assert "DeformedTissue, unseen objects" in made["gains_deformedtissue_unseen"].title
+    # Of one object nothing is decided.
+    assert set(verdicts(made["deformation_deformedtissue_unseen"].data).values()) == {"undecided"}
+    # Where there are no others, they are the dataset.
+    alone = tables.load_metrics([write(tmp_path / "u.csv", unseen)])
+    assert set(alone["dataset"]) == {"deformedtissue"}
+    assert "DeformedTissue, unseen objects;" in tables.paper_table(1, alone).caption
 
 
 def test_table_three_pools_levels_and_matches_percent_and_sigma(metrics):
@@ -291,7 +341,7 @@ def test_other_datasets_have_no_published_columns(metrics):
     assert [cell.text for cell in table.rows[0]][:2] == ["not given", "2"]
     assert len(table.rows) == 1
     assert table.data["published_mean_1e-4"].isna().all()
-    assert table.caption.startswith("DINE on liver (data supplied by the user).")
+    assert table.caption.startswith("DINE on liver (data supplied by the user), known objects.")
     assert "paper" not in table.caption
 
 
@@ -300,11 +350,11 @@ def test_other_datasets_have_no_published_columns(metrics):
     [
         (
             "synthetic",
-            "DINE on synthetic data in the layout of DeformedTissue; published values are on the "
-            "real DeformedTissue data and are not comparable in absolute terms.",
+            "DINE on synthetic data in the layout of DeformedTissue, known objects; published "
+            "values are on the real DeformedTissue data and are not comparable in absolute terms.",
         ),
         ("bases", "DINE on real base meshes with synthetic deformations in the layout of "),
-        ("doi", "DINE on DeformedTissue (published data)."),
+        ("doi", "DINE on DeformedTissue (published data), known objects."),
     ],
 )
 def test_captions_tell_the_origin(metrics, origin, start):
@@ -349,7 +399,7 @@ def test_write_table_writes_three_formats(tmp_path, metrics):
     )
     assert tidy["mean_1e-4"] == pytest.approx(8)
     assert tidy["published_mean_1e-4"] == pytest.approx(13.03)
-    assert tidy["lowest"]
+    assert tidy["verdict"] == "lower"
     markdown = paths[1].read_text(encoding="utf-8")
     lines = [line for line in markdown.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in lines} == {len(table.header) + 1}

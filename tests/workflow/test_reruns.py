@@ -39,7 +39,18 @@ EGGS = ("datasets", "eggs")
 SETTINGS = {
     "Stage 1": (("stage1", "steps"), 201, ALL),
     "Stage 2": (("stage2", "steps"), 101, STAGE2),
-    "values of λ": (("lambda_search", "candidates"), [1.0e-3], WEIGHT),
+    "values of λ": (("lambda_search", "candidates"), [1.0e-4, 1.0e-3], WEIGHT),
+    "how far the values of λ go on": (("lambda_search", "extend"), 0, WEIGHT),
+    "a search of λ that is there already": (
+        ("backbones", "affine", "own_lambda"),
+        True,
+        Counter(figures=1, html=1),
+    ),
+    "the only dataset of a backbone": (
+        ("backbones", "affine", "datasets"),
+        ["eggs"],
+        Counter(figures=1, html=1),
+    ),
     "the PCA prior": (
         ("priors", "pca", "arguments", "components"),
         1,
@@ -58,6 +69,20 @@ SETTINGS = {
         TESTED + Counter(corrupt=1),
     ),
     "the recipe": ((*EGGS, "recipe", "amplitude"), 0.2, ALL + DATA + Counter(raw=1)),
+    "more deformations": ((*EGGS, "recipe", "pairs_per_level"), 2, ALL + DATA + Counter(raw=1)),
+    "a split by deformation": ((*EGGS, "pairs", "split", "by"), "deformation", ALL + DATA),
+    "unseen objects": ((*EGGS, "unseen"), {"folder": "meshes"}, ALL + DATA + Counter(raw_unseen=1)),
+    "targets of other points": (
+        (*EGGS, "corruption", "resampled"),
+        True,
+        TESTED + Counter(resample=1),
+    ),
+    "fewer corrupted pairs": ((*EGGS, "corruption", "pairs"), 1, TESTED + Counter(corrupt=1)),
+    "the chance of a training": (
+        ("evaluation", "training_spread"),
+        0.2,
+        Counter(tables=1, html=1),
+    ),
     "the index convention": ((*EGGS, "pairs", "convention"), "none", ALL + DATA),
     "another target": (("pretraining", "steps"), 7, Counter(html=1)),
     "threads": (("threads",), 2, Counter(html=1)),
@@ -72,7 +97,10 @@ CODE = {
     "dine/priors/pca.py": WEIGHT + Counter(fit_prior=1),
     "dine/evaluation/conditions.py": TESTED,
     "dine/evaluation/metrics.py": Counter(evaluate=4) + SHOWN,
+    "dine/evaluation/statistics.py": SHOWN,
+    "dine/data/names.py": ALL + DATA + Counter(raw=1),
     "dine/reporting/tables.py": SHOWN,
+    "dine/reporting/effects.py": Counter(html=1),
     "dine/reporting/figures.py": Counter(figures=1, html=1),
     "dine/reporting/report.html": Counter(html=1),
     "code/my_package/backbones.py": ALL,
@@ -80,7 +108,6 @@ CODE = {
     "code/my_package/priors.py": ONE_PRIOR,
     # Not used here.
     "dine/priors/flow.py": Counter(),
-    "dine/evaluation/statistics.py": Counter(),
     "dine/registration/view.py": Counter(),
     "code/my_package/data.py": Counter(),
 }

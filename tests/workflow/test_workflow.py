@@ -14,12 +14,14 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+from dine import config
 from dine.cli import cli
 from dine.data.deformation import rbf_displacement
 from dine.data.pairs import read_pairs
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.data.synthetic import primitive
+from dine.results import table_names
 
 ROOT = Path(__file__).parents[2]
 TINY = "config/tiny.yaml"
@@ -77,10 +79,13 @@ def test_everything_is_there(finished):
     results = finished / RESULTS
     tables = {path.stem for path in (results / "tables").glob("*.csv")}
     assert {"table1", "table2", "table3", "gains_synbench", "correspondence_synbench"} <= tables
+    # What is written is what is expected: the rule's own outputs, and nothing beside.
+    assert tables == set(table_names(config.load(finished / "config.yaml", finished / TINY)))
+    assert "deformation_synbench_unseen" in tables
     for table in tables:
         assert (results / "tables" / f"{table}.md").stat().st_size > 0
         assert (results / "tables" / f"{table}.tex").stat().st_size > 0
-    assert len(list((results / "figures").glob("*.png"))) == 25
+    assert len(list((results / "figures").glob("*.png"))) == 31
     report = (results / "report.html").read_text()
     assert "synthetic" in report
     assert not re.search(r"(src|href)=.https?:", report)
@@ -119,28 +124,32 @@ def test_a_second_run_has_nothing_to_do(finished):
 REPORTING = {"resolved_config", "tables", "figures", "html", "all"}
 
 CHANGES = {
+    # λ is searched with the priors, so all Stage 2 runs that take a λ of that search follow.
     "flow": (
         {"priors": {"flow": {"arguments": {"steps": 51}}}},
-        {"fit_prior": 2, "stage2_prior": 2, "predict": 2, "evaluate": 2},
+        {"fit_prior": 3, "search_lambda": 1, "stage2_prior": 10, "predict": 10, "evaluate": 10},
     ),
-    # λ is searched with the PCA prior, so its Stage 2 runs, and those that take its λ, follow.
     "pca": (
         {"priors": {"pca": {"arguments": {"shrinkage": 0.1}}}},
-        {"fit_prior": 4, "search_lambda": 1, "stage2_prior": 6, "predict": 6, "evaluate": 6},
+        {
+            **{"fit_prior": 5, "search_lambda": 1, "search_own_lambda": 1},
+            **{"stage2_prior": 12, "predict": 12, "evaluate": 12},
+        },
     ),
     "stage 2": (
         {"stage2": {"steps": 7}},
         {
             "search_lambda": 1,
-            "stage2_control": 4,
-            "stage2_prior": 6,
-            "predict": 10,
-            "evaluate": 10,
+            "search_own_lambda": 1,
+            "stage2_control": 5,
+            "stage2_prior": 12,
+            "predict": 17,
+            "evaluate": 17,
         },
     ),
     "one more noise level": (
         {"datasets": {"deformedtissue": {"corruption": {"noise": [0.03, 0.05]}}}},
-        {"corrupt": 1, "predict": 7, "evaluate": 7},
+        {"corrupt": 1, "predict": 9, "evaluate": 9},
     ),
     "one dataset": (
         {"datasets": {"deformedtissue": {"pairs": {"convention": "none"}}}},
@@ -148,13 +157,14 @@ CHANGES = {
             "pairs": 1,
             "agreement": 1,
             "corrupt": 2,
+            "resample": 1,
             "stage1": 2,
             "fields": 2,
-            "fit_prior": 3,
+            "fit_prior": 5,
             "stage2_control": 2,
-            "stage2_prior": 3,
-            "predict": 7,
-            "evaluate": 7,
+            "stage2_prior": 5,
+            "predict": 9,
+            "evaluate": 9,
         },
     ),
 }
@@ -203,7 +213,8 @@ def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
     # Four Stage-2 runs on DefTransNet; of Robust-DefReg only what the search of λ needs.
     assert jobs["stage1"] == 3
     assert (jobs["stage2_control"], jobs["stage2_prior"]) == (2, 2)
-    assert jobs["fit_prior"] == 3
+    assert jobs["fit_prior"] == 5
+    assert "search_own_lambda" not in jobs
     assert "figures" not in jobs
     assert "html" not in jobs
 
@@ -211,17 +222,47 @@ def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
 def test_the_evidence_is_planned_from_its_config(tmp_path):
     folder = copy_workflow(tmp_path)
     jobs = planned(folder, "evidence", "--configfile", TINY)
-    # Two datasets, backbones and seeds; one group of methods without a backbone for each dataset.
-    assert jobs["stage1"] == jobs["stage2_control"] == 8
-    assert jobs["evidence_evaluate"] == 10
+    # Two seeds of two backbones and, on one of two datasets, a third; one group of methods without
+    # a backbone for each dataset.
+    assert jobs["stage1"] == jobs["stage2_control"] == 10
+    assert jobs["evidence_evaluate"] == 12
     assert jobs["evidence_classical"] == 4
-    assert jobs["search_lambda"] == 1
+    assert jobs["search_lambda"] == jobs["search_own_lambda"] == 1
     changes = folder / "changes.yaml"
     changes.write_text("evidence: {seeds: [0], methods: {cpd: null, map: null}}")
     fewer = planned(folder, "evidence", "--configfile", TINY, changes)
-    assert fewer["stage1"] == 4
+    assert fewer["stage1"] == 5
     assert fewer["evidence_classical"] == 2
     assert fewer["evidence_refine"] < jobs["evidence_refine"]
+
+
+def test_searches_of_lambda_get_the_files_of_the_priors_that_they_name(tmp_path):
+    folder = copy_workflow(tmp_path)
+    search = {"lambda_search": {"priors": ["pca", "flow", "pca_residual"]}}
+    said = snakemake(folder, "-n", "-p", *changed(folder, search)).stdout
+    commands = [line for line in said.splitlines() if " search-lambda " in line]
+    assert len(commands) == 2
+    for line in commands:
+        given = re.findall(r"--prior (\w+) \S*/(\w+)\.safetensors", line.replace("'", ""))
+        expected = ["pca", "flow", "pca_residual"]
+        if "geometric" in line:  # it has no flow
+            expected.remove("flow")
+        assert given == [(name, name) for name in expected]
+
+
+def test_the_evidence_draws_targets_of_unseen_objects_anew_too(tmp_path):
+    folder = copy_workflow(tmp_path)
+    for number in range(4):
+        place = folder / f"{'seen' if number else 'others'}"
+        write_surface(place / f"organ{number}.ply", primitive(number, 0))
+    mine = {"source": {"kind": "path", "folder": "seen"}, "unseen": {"folder": "others"}}
+    mine |= {"pairs": {"points": 64, "convention": "sphere"}}
+    settings = {"datasets": {"mine": mine}, "evidence": {"resampled": True}}
+    target = Path(RESULTS) / "evidence" / "mine" / "variants" / "resampled_1.h5"
+    said = snakemake(folder, "-n", "-p", target, *changed(folder, settings)[1:]).stdout
+    (line,) = [line for line in said.splitlines() if " resample " in line]
+    assert line.count("--raw ") == 2
+    assert "mine/unseen/raw.json" in line
 
 
 def test_a_finished_model_is_restored_bit_for_bit(finished):
