@@ -11,6 +11,7 @@ from dine.data.deformation import rbf_displacement
 from dine.data.surface import Surface
 from dine.errors import DataError
 
+pytestmark = pytest.mark.numerical
 RECIPE = {"level": 0.3, "control_percent": 5, "width": 0.4, "amplitude": 0.25, "points": 1024}
 
 

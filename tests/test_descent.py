@@ -15,6 +15,7 @@ from dine.registration.descent import descend
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
 
+pytestmark = pytest.mark.numerical
 POINTS = 20
 OF_CLOUDS = [name for name in DATA_TERMS.names() if name != "l1"]
 

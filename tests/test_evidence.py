@@ -23,6 +23,7 @@ from dine.reporting.evidence.comparisons import at
 from dine.reporting.evidence.findings import all_findings
 from dine.reporting.figures import save_figure
 
+pytestmark = pytest.mark.numerical
 DATASETS = ("deformedtissue", "synbench")
 BACKBONES = ("robust_defreg", "deftransnet")
 LEVELS = (0.2, 0.4, 0.6, 0.8)

@@ -18,6 +18,7 @@ from dine.training import loop, parallel
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
 
+pytestmark = pytest.mark.numerical
 ROUNDING = 1e-5
 """Of what was learned: float32 gradients agree to some 1e-7, and Adam's steps are their ratios."""
 

@@ -20,6 +20,7 @@ from dine.priors.gaussian import squared_exponential
 from dine.priors.likelihood import Unfinished
 from dine.priors.sources import SourceCache, held_out_folds, source_labels
 
+pytestmark = pytest.mark.numerical
 POINTS = 20
 QUICK = {
     "pca": {"components": 6},

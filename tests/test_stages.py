@@ -31,6 +31,8 @@ from dine.training import stages
 from dine.training.data_terms import DATA_TERMS
 from dine.training.stage2 import selected_lambda
 
+numerical = pytest.mark.numerical
+
 
 def test_stage1_writes_weights_history_and_record(chain):
     record = read_json(chain / "stage1" / "run.json")
@@ -44,6 +46,7 @@ def test_stage1_writes_weights_history_and_record(chain):
     assert history["val_cd"].notna().tolist() == [False, False, True]
 
 
+@numerical
 def test_fields_are_the_models_own_on_the_training_split(chain):
     stored = read_fields(chain / "dvf.h5")
     train = read_pairs(chain / "pairs.h5", split="train")
@@ -58,6 +61,7 @@ def test_fields_are_the_models_own_on_the_training_split(chain):
     assert (again.seconds > 0).all()
 
 
+@numerical
 def test_lambda_is_the_best_candidate_on_validation_pairs(chain):
     result = read_json(chain / "lambda.json")
     curve = pd.DataFrame(result["curve"])
@@ -77,6 +81,7 @@ def run_stage2(chain, out, *arguments):
     return read_json(out / "run.json"), (out / "model.safetensors").read_bytes()
 
 
+@numerical
 def test_stage2_and_its_control(chain, tmp_path):
     prior = ("--prior", chain / "pca.safetensors", "--variant", "pca")
     control, control_weights = run_stage2(chain, tmp_path / "control")
@@ -97,12 +102,14 @@ def test_stage2_and_its_control(chain, tmp_path):
     assert found["lambda"] == read_json(chain / "lambda.json")["selected"]["pca"]
 
 
+@numerical
 def test_equal_runs_give_equal_bytes(chain, tmp_path):
     dine("stage1", "--pairs", chain / "pairs.h5", "--settings", STAGE1, "--out", tmp_path)
     first = (chain / "stage1" / "model.safetensors").read_bytes()
     assert (tmp_path / "model.safetensors").read_bytes() == first
 
 
+@numerical
 def test_precision_is_recorded_and_part_of_the_identity(chain, tmp_path):
     train = ("stage1", "--pairs", chain / "pairs.h5", "--settings", STAGE1, "--out", tmp_path)
     dine(*train)
@@ -140,22 +147,31 @@ def start_training(chain, out, processes):
     return command, process
 
 
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.fixture(scope="module", params=[1, 2])
+def undisturbed(request, chain, tmp_path_factory):
+    """Number of processes, and what such a training leaves when nobody kills it."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    command = training_command(chain, out, processes=request.param)
+    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    assert read_json(out / "run.json")["processes"] == request.param
+    return request.param, out
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(chain, tmp_path, number, processes):
-    command, process = start_training(chain, tmp_path / "killed", processes)
+def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(
+    chain, tmp_path, number, undisturbed
+):
+    processes, whole = undisturbed
+    command, process = start_training(chain, tmp_path, processes)
     process.send_signal(number)
     error = process.communicate()[1]
     assert process.returncode == (1 if number == signal.SIGTERM else -number)
     assert ("run the same command again" in error) == (number == signal.SIGTERM)
-    assert not (tmp_path / "killed" / "model.safetensors").exists()
+    assert not (tmp_path / "model.safetensors").exists()
     again = subprocess.run(command, stderr=subprocess.PIPE, text=True)
     assert "going on from step" in again.stderr
-    command[command.index(tmp_path / "killed")] = tmp_path / "whole"
-    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
-    whole = (tmp_path / "whole" / "model.safetensors").read_bytes()
-    assert (tmp_path / "killed" / "model.safetensors").read_bytes() == whole
-    assert read_json(tmp_path / "whole" / "run.json")["processes"] == processes
+    expected = (whole / "model.safetensors").read_bytes()
+    assert (tmp_path / "model.safetensors").read_bytes() == expected
 
 
 def test_one_of_several_processes_dies(chain, tmp_path):
@@ -258,6 +274,7 @@ def test_a_flow_that_is_no_longer_asked_for_is_not_written(chain, tmp_path, monk
     )
 
 
+@numerical
 def test_predictions_and_metrics(chain, tmp_path):
     model, pairs = chain / "stage1" / "model.safetensors", chain / "pairs.h5"
     variant = ("--variant", chain / "outliers_25.h5")
@@ -292,6 +309,7 @@ def test_predictions_and_metrics(chain, tmp_path):
     assert metrics.iloc[0]["cd_unregistered"] == pytest.approx(unregistered, rel=1e-4)
 
 
+@numerical
 def test_metrics_agree_with_the_training_loss():
     a = np.random.default_rng(0).random((30, 3))
     b = np.random.default_rng(1).random((40, 3))
@@ -354,6 +372,7 @@ def test_a_prior_needs_a_weight_and_the_control_takes_none(chain, tmp_path):
         dine(*start, *model, *prior)
 
 
+@numerical
 def test_a_variant_may_differ_in_its_data_term_alone(chain, tmp_path):
     record, weights = run_stage2(
         chain,
@@ -371,6 +390,7 @@ def test_a_variant_may_differ_in_its_data_term_alone(chain, tmp_path):
     assert weights != control
 
 
+@numerical
 @pytest.mark.parametrize(
     ("fields", "same"), [("predicted", True), ("exact", False), ("shuffled", False)]
 )
@@ -388,6 +408,7 @@ def test_what_a_prior_is_fitted_to(chain, tmp_path, fields, same):
         assert np.allclose(mean.mean(axis=0), stored.displacement.mean(axis=(0, 1)), atol=1e-6)
 
 
+@numerical
 def test_training_can_start_from_given_weights(chain, tmp_path):
     start = chain / "stage1" / "model.safetensors"
     settings = json.loads(STAGE1) | {"start": str(start), "steps": 1}
@@ -477,6 +498,7 @@ def resampled(chain):
     return out
 
 
+@numerical
 def test_resampled_targets_lie_on_the_target_but_share_no_point(chain, resampled):
     pairs = read_pairs(chain / "pairs.h5")
     found = read_variant(resampled, pairs)
@@ -491,6 +513,7 @@ def test_resampled_targets_lie_on_the_target_but_share_no_point(chain, resampled
     assert again.read_bytes() == resampled.read_bytes()
 
 
+@numerical
 def test_pretraining_sees_both_kinds_of_targets(chain, resampled, tmp_path):
     settings = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
     both = tmp_path / "both"
@@ -507,6 +530,7 @@ def test_pretraining_sees_both_kinds_of_targets(chain, resampled, tmp_path):
         dine(*arguments, *pairs, "--targets", resampled, "--out", tmp_path / "x")
 
 
+@numerical
 def test_fields_of_resampled_targets_differ(chain, resampled, tmp_path):
     model = ("--model", chain / "stage1" / "model.safetensors", "--pairs", chain / "pairs.h5")
     dine("fields", *model, "--targets", resampled, "--out", tmp_path / "dvf.h5")
@@ -514,6 +538,7 @@ def test_fields_of_resampled_targets_differ(chain, resampled, tmp_path):
     assert (other != own).any()
 
 
+@numerical
 def test_a_prior_is_fitted_to_several_files_of_fields(chain, tmp_path):
     fields = ("--fields", chain / "dvf.h5") * 2
     settings = '{"kind": "pca", "arguments": {"components": 2}}'
