@@ -139,51 +139,50 @@ def wait_for(path, there=True):
         time.sleep(0.01)
 
 
-def start_training(chain, out, processes):
-    """A training that has saved its state at least once, as a process, and its command."""
-    command = training_command(chain, out, processes=processes)
+def interrupted(command, out, kill):
+    """A training that has come further than before, killed; its return code and what it said."""
+    history = out / "training" / "history.csv"
+    before = history.read_bytes() if history.exists() else None
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    wait_for(out / "training" / "history.csv")
-    return command, process
+    give_up = time.monotonic() + 300
+    while time.monotonic() < give_up:
+        if history.exists() and history.read_bytes() != before:
+            break
+        time.sleep(0.01)
+    kill(process)
+    return process.communicate(timeout=300)[1], process.returncode
 
 
-@pytest.fixture(scope="module", params=[1, 2])
-def undisturbed(request, chain, tmp_path_factory):
-    """Number of processes, and what such a training leaves when nobody kills it."""
-    out = tmp_path_factory.mktemp("undisturbed")
-    command = training_command(chain, out, processes=request.param)
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_training_killed_again_and_again_is_resumed_bit_for_bit(chain, tmp_path, processes):
+    out, whole = tmp_path / "killed", tmp_path / "whole"
+    command = training_command(chain, out, processes=processes)
+    started = []
+
+    def kill_first(process):
+        number = int((out / "training" / "lock.holder").read_text().split()[1])
+        assert number != process.pid
+        os.kill(number, signal.SIGKILL)
+
+    if processes > 1:
+        said, code = interrupted(command, out, kill_first)
+        assert code == 1
+        assert "Process 1 of 2 died (SIGKILL); run the same command again" in said
+        started.append(said)
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        said, code = interrupted(command, out, lambda process, n=number: process.send_signal(n))
+        assert code == (1 if number == signal.SIGTERM else -number)
+        assert ("run the same command again" in said) == (number == signal.SIGTERM)
+        started.append(said)
+        assert not (out / "model.safetensors").exists()
+    started.append(subprocess.run(command, stderr=subprocess.PIPE, text=True).stderr)
+    went_on = ["going on from step" in said for said in started]
+    assert went_on == [False] + [True] * (len(started) - 1)
+    command = training_command(chain, whole, processes=processes)
     subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
-    assert read_json(out / "run.json")["processes"] == request.param
-    return request.param, out
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_process_killed_in_the_middle_is_resumed_bit_for_bit(
-    chain, tmp_path, number, undisturbed
-):
-    processes, whole = undisturbed
-    command, process = start_training(chain, tmp_path, processes)
-    process.send_signal(number)
-    error = process.communicate()[1]
-    assert process.returncode == (1 if number == signal.SIGTERM else -number)
-    assert ("run the same command again" in error) == (number == signal.SIGTERM)
-    assert not (tmp_path / "model.safetensors").exists()
-    again = subprocess.run(command, stderr=subprocess.PIPE, text=True)
-    assert "going on from step" in again.stderr
     expected = (whole / "model.safetensors").read_bytes()
-    assert (tmp_path / "model.safetensors").read_bytes() == expected
-
-
-def test_one_of_several_processes_dies(chain, tmp_path):
-    command, process = start_training(chain, tmp_path, 2)
-    leader = int((tmp_path / "training" / "lock.holder").read_text().split()[1])
-    assert leader != process.pid
-    os.kill(leader, signal.SIGKILL)
-    error = process.communicate(timeout=60)[1]
-    assert process.returncode == 1
-    assert "Process 1 of 2 died (SIGKILL); run the same command again" in error
-    again = subprocess.run(command, check=True, stderr=subprocess.PIPE, text=True)
-    assert "going on from step" in again.stderr
+    assert (out / "model.safetensors").read_bytes() == expected
+    assert read_json(whole / "run.json")["processes"] == processes
 
 
 def test_an_orphan_holds_its_folder_until_it_ends(chain, tmp_path):
@@ -208,7 +207,7 @@ def test_an_orphan_holds_its_folder_until_it_ends(chain, tmp_path):
     again = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     wait_for(holder)
     again.terminate()
-    assert f"going on from step {state['step']}" in again.communicate(timeout=60)[1]
+    assert f"going on from step {state['step']}" in again.communicate(timeout=300)[1]
 
 
 def test_results_that_are_no_longer_asked_for_are_not_written(chain, tmp_path, monkeypatch):
@@ -243,13 +242,13 @@ def test_the_fit_of_a_flow_is_a_training(chain, tmp_path):
     refused = subprocess.run(command, stderr=subprocess.PIPE, text=True)
     assert f"{folder} is in use by process {process.pid} on" in refused.stderr
     process.terminate()
-    assert "flow prior was stopped after step" in process.communicate(timeout=60)[1]
+    assert "flow prior was stopped after step" in process.communicate(timeout=300)[1]
     step = torch.load(folder / "state.pt", weights_only=True)["step"]
     assert not out.exists()
     again = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     wait_for(folder / "lock.holder")
     again.terminate()
-    assert f"flow prior: going on from step {step}" in again.communicate(timeout=60)[1]
+    assert f"flow prior: going on from step {step}" in again.communicate(timeout=300)[1]
 
 
 def test_a_flow_that_is_no_longer_asked_for_is_not_written(chain, tmp_path, monkeypatch):
