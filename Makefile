@@ -7,7 +7,7 @@ INPUTS ?= 12000
 SEED ?= 0
 BIN := .venv/bin
 
-.PHONY: run tiny test kill-test fuzz test-oldest check format docs wheel-check slurm-test profiles-check audit lock
+.PHONY: run tiny test test-cpus kill-test fuzz test-oldest check format docs wheel-check slurm-test profiles-check audit lock
 
 run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
@@ -15,8 +15,15 @@ run: .venv/installed
 tiny: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all evidence --configfile config/tiny.yaml
 
+# Two workers, on a core each.
+PYTEST := $(BIN)/pytest -n 2 --dist loadgroup --no-loadscope-reorder
+
 test: .venv/installed
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(PYTEST)
+
+# What may come out otherwise on another CPU, under each of several; `.ci/cpus.py list` names them.
+test-cpus: .venv/installed
+	.ci/cpus.py all -- $(PYTEST) -m numerical
 
 # The workflow killed at random moments in every step, and run again: some twenty minutes.
 kill-test: .venv/installed

@@ -1,5 +1,6 @@
 import importlib
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,26 @@ from commands import RAW, STAGE1, STAGE2, dine
 from dine import provenance
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+# Longest first, so that no worker is left alone with one of them in the end.
+LONG = ("workflow/test_workflow.py", "workflow/", "test_stages.py", "test_fuzz.py", "test_parallel")
+
+
+def pytest_collection_modifyitems(items):
+    """``pytest -n 2 --dist loadgroup``: a file, or what it marks as a group, stays together."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    here = Path(__file__).parent
+
+    def place(item):
+        name = item.path.relative_to(here).as_posix()
+        return next((i for i, start in enumerate(LONG) if name.startswith(start)), len(LONG))
+
+    items.sort(key=place)
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.relative_to(here).as_posix()))
 
 
 @pytest.fixture

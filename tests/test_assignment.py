@@ -8,6 +8,7 @@ from dine.data.assignment import cheapest_assignment
 from dine.data.sampling import convention_order, fibonacci_sphere, sample_surface, sunflower_disc
 from dine.data.synthetic import primitive, tissue_patch
 
+pytestmark = pytest.mark.numerical
 TEMPLATES = {"sphere": fibonacci_sphere, "disc": sunflower_disc}
 
 

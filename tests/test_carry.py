@@ -10,6 +10,7 @@ from dine.errors import DataError
 from dine.registration import carry as module
 from dine.registration.carry import carry
 
+pytestmark = pytest.mark.numerical
 RNG = np.random.default_rng(0)
 SHAPES = {
     "ball": RNG.normal(size=(60, 3)),

@@ -10,6 +10,7 @@ from dine.errors import ConfigError, DataError
 from dine.registration.bcpd import bcpd
 from dine.registration.classical import CLASSICAL
 
+pytestmark = pytest.mark.numerical
 DEFORMABLE = ["bcpd", "cpd"]
 
 

@@ -4,6 +4,8 @@ import pytest
 from dine.data.corruption import add_outliers, gaussian_noise
 from dine.errors import ConfigError, DataError
 
+pytestmark = pytest.mark.numerical
+
 
 @pytest.fixture
 def target():

@@ -10,6 +10,7 @@ from dine.data.batch import make_batch
 from dine.errors import ConfigError
 from dine.training.data_terms import DATA_TERMS
 
+pytestmark = pytest.mark.numerical
 ROBUST = ("correntropy", "density_aware", "hyperbolic", "landau")
 OF_CLOUDS = ("chamfer", *ROBUST, "refined")  # need no true displacement
 
@@ -124,7 +125,7 @@ COSTS = {
 }
 
 
-@pytest.mark.parametrize(("term", "cost"), COSTS.items(), ids=str)
+@pytest.mark.parametrize(("term", "cost"), COSTS.items(), ids=[str(term) for term in COSTS])
 def test_costs_of_residuals_follow_their_definitions(term, cost):
     name, arguments = term
     moved, target = cloud(6), cloud(9, 1)

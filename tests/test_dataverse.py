@@ -556,7 +556,8 @@ def test_a_published_dataset_goes_from_server_to_pairs(server, tmp_path):
     assert sorted(pairs.split) == ["test", "train", "val"]
 
 
-def test_without_a_network_the_workflow_says_what_to_do(tmp_path):
+def test_without_a_network_the_workflow_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(dataverse.time, "sleep", lambda seconds: None)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         server = f"http://127.0.0.1:{free.getsockname()[1]}"

@@ -11,6 +11,7 @@ from dine.data.deformation import rbf_displacement
 from dine.data.surface import Surface
 from dine.errors import DataError
 
+pytestmark = pytest.mark.numerical
 RECIPE = {"level": 0.3, "control_percent": 5, "width": 0.4, "amplitude": 0.25, "points": 1024}
 
 
@@ -104,6 +105,23 @@ def test_unused_vertices_do_not_set_the_scale_but_move_with_the_rest():
     np.testing.assert_allclose(moved[:-2], field(clean), rtol=1e-12)
     assert not moved[-2].any()
     np.testing.assert_array_equal(moved[-1], moved[7])
+
+
+def test_coincident_vertices_move_together_however_products_are_rounded(monkeypatch):
+    """As by a library that takes the last rows of a product in another order."""
+    mesh = sphere()
+    soup = Surface(
+        mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(mesh.faces.size).reshape(-1, 3)
+    )
+    distances = deformation.cdist
+    monkeypatch.setattr(
+        deformation,
+        "cdist",
+        lambda a, *rest: distances(a, *rest) * (1 + 1e-14 * np.arange(len(a)))[:, None],
+    )
+    moved = field(soup).reshape(-1, 3)
+    for vertex in range(len(mesh.vertices)):
+        assert len(np.unique(moved[mesh.faces.ravel() == vertex], axis=0)) == 1
 
 
 def test_chunks_do_not_change_the_field(monkeypatch):

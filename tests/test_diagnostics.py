@@ -9,6 +9,7 @@ from dine.priors import PRIORS
 from dine.priors.base import Prior
 from dine.priors.diagnostics import diagnose
 
+pytestmark = pytest.mark.numerical
 POINTS = 24
 QUICK = {
     "pca": {"components": 6},

@@ -24,6 +24,7 @@ from dine.models.checkpoint import load_backbone, save_backbone
 from dine.priors import load_prior
 from dine.training.data_terms import DATA_TERMS
 
+pytestmark = pytest.mark.numerical
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples" / "extending"
 CONFIGS = (ROOT / "config.yaml", EXAMPLES / "config.yaml")

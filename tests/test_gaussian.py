@@ -3,9 +3,11 @@
 import math
 
 import numpy as np
+import pytest
 
 from dine.priors.gaussian import LinearGaussian, covariance_root, squared_exponential
 
+pytestmark = pytest.mark.numerical
 WIDTHS, AMPLITUDES, AFFINE = (0.9, 1.5), (0.2, 0.5), 0.4
 
 

@@ -10,6 +10,8 @@ from dine.geometry.chamfer import chamfer_distance, nearest_squared
 from dine.geometry.graph import batch_graphs, neighbour_graph
 from dine.geometry.neighbours import squared_distances
 
+pytestmark = pytest.mark.numerical
+
 
 def cloud(count, seed=0):
     return np.random.default_rng(seed).normal(size=(count, 3))

@@ -21,6 +21,7 @@ from dine.registration.classical import CLASSICAL
 from dine.registration.refine import refine
 from dine.training.stages import new_backbone
 
+pytestmark = pytest.mark.numerical
 TURN = Rotation.from_euler("xyz", [0.4, -1.1, 2.0]).as_matrix()
 SHIFT = np.array([3.0, -2.0, 0.5])
 MOTIONS = {

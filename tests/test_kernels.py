@@ -16,6 +16,7 @@ from dine.models.compiled.convolution import EdgeConvolution, Edges
 from dine.models.compiled.messages import BeliefPropagation
 from dine.models.compiled.rows import NormLeakyReLU
 
+pytestmark = pytest.mark.numerical
 EPS = features.NORM_EPS
 BOTH = pytest.mark.parametrize("path", ["compiled", "eager"])
 

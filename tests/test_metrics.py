@@ -29,6 +29,7 @@ from dine.evaluation.quality import (
 )
 from dine.reporting.tables import COLUMNS, all_tables, load_metrics, to_latex, to_markdown
 
+pytestmark = pytest.mark.numerical
 # ------------------------------------------------------------------------------------ measures
 
 

@@ -26,6 +26,7 @@ from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
 
+pytestmark = pytest.mark.numerical
 POINTS = 64
 FRACTIONS = {"train": 0.6, "val": 0.2, "test": 0.2}
 COLUMNS = [name for name in PairSet.__dataclass_fields__ if name != "attributes"]

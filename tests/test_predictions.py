@@ -21,6 +21,8 @@ from dine.registration.classical_predictions import classical_predictions
 from dine.registration.predictions import refine_predictions
 from dine.reporting.evidence.examples import typical
 
+pytestmark = pytest.mark.numerical
+
 
 def dine(*arguments):
     done = CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)

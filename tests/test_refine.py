@@ -14,6 +14,8 @@ from dine.registration.refine import expected_error, refine
 from dine.registration.shared_points import SharedPoints
 from dine.training.stages import shipped_weights
 
+pytestmark = pytest.mark.numerical
+
 
 def organ(count, seed):
     """Points (count, 3) of an ellipsoid's surface, drawn evenly enough."""

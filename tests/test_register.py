@@ -25,6 +25,7 @@ from dine.registration.refine import ROUNDS
 from dine.registration.register import load_model
 from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 
+pytestmark = pytest.mark.numerical
 POINTS = 1024
 
 

@@ -14,6 +14,8 @@ from dine.data.sampling import (
 from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
 
+pytestmark = pytest.mark.numerical
+
 
 def rng(seed=0):
     return np.random.default_rng(seed)

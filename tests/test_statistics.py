@@ -21,6 +21,8 @@ from dine.evaluation.statistics import (
     wilcoxon,
 )
 
+pytestmark = pytest.mark.numerical
+
 
 def rows(method, mce, *, seed=0, levels=(0.5,), per_object=1, **changes):
     """Metrics of made-up pairs; ``mce`` has one value per pair and level, level by level."""

@@ -6,6 +6,7 @@ from scipy.spatial import ConvexHull
 from dine.data.surface import Surface
 from dine.data.synthetic import FAMILIES, primitive, tissue_patch
 
+pytestmark = pytest.mark.numerical
 PRIMITIVES = range(2 * len(FAMILIES))
 PATCHES = range(12)
 

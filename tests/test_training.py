@@ -22,6 +22,7 @@ from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
 from dine.training.stages import new_backbone
 
+pytestmark = pytest.mark.numerical
 IDENTITY = {"settings": "a", "inputs": "b", "code": "c"}
 SETTINGS = Training(steps=6, validate_every=3, validation_pairs=2, save_seconds=1e-9)
 

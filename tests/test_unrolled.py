@@ -11,6 +11,8 @@ from dine.registration.expectation import Model
 from dine.registration.refine import expected_error, refine
 from dine.training.unrolled import Refined
 
+pytestmark = pytest.mark.numerical
+
 
 def sphere(count, seed=0):
     points = np.random.default_rng(seed).normal(size=(count, 3))

@@ -95,7 +95,14 @@ def rbf_displacement(
         block = slice(start, start + step)
         squared = cdist(vertices[block], controls, "sqeuclidean")
         field[block] = np.exp(squared / -(width**2)) @ moves
-    return field * radius
+    return _together(vertices, field) * radius
+
+
+def _together(vertices: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """The field with one value for coincident vertices: where a product's last rows are rounded
+    otherwise than the others, as on some CPUs, a mesh would tear at its seams."""
+    _, first, place = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    return field if len(first) == len(vertices) else field[first[place.ravel()]]
 
 
 def check_recipe(
