@@ -24,6 +24,9 @@ SUMMARISED = (
 )
 """Metrics of ``summary``, which adds the failure rate."""
 
+FEWEST_CLUSTERS = 5
+"""With fewer, an interval from drawing them anew says next to nothing."""
+
 _GROUP = ["dataset", "backbone", "condition", "corruption"]
 _PAIR = ["pair", "object", "cluster", "level"]
 _NEEDED = ["dataset", "backbone", "method", "seed", *_PAIR, "condition", "corruption"]
@@ -383,8 +386,11 @@ def verdicts(
     no zero, otherwise ``undecided``.
 
     The interval joins two sources of chance as independent: that of the pairs
-    (:func:`cluster_bootstrap`), and that of the training, as another seed or the rounding of
-    another CPU gives another network from the same data: ± 1.96 ``spread`` / √(number of seeds).
+    (:func:`cluster_bootstrap`, widened for n clusters by t / 1.96 · √(n / (n − 1)) with the 97.5 %
+    quantile t of n − 1 degrees of freedom: Hesterberg (2015), The American Statistician 69,
+    section 5.3), and that of the training, as another seed or the rounding of another CPU gives
+    another network from the same data: ± 1.96 ``spread`` / √(number of seeds). With fewer than
+    ``FEWEST_CLUSTERS`` there is no interval, and nothing is decided.
 
     Args:
         metrics: rows of ``metrics.csv``.
@@ -413,8 +419,11 @@ def verdicts(
     table = pd.concat(found, ignore_index=True)
     percent = 100 / table["mean_reference"].where(table["mean_reference"] > 0)
     chance = 1.96 * 100 * spread / np.sqrt(table[["seeds_method", "seeds_reference"]].min(axis=1))
+    clusters = table["clusters"].where(table["clusters"] >= FEWEST_CLUSTERS)
+    wider = stats.t.ppf(0.975, clusters - 1) / 1.96 * np.sqrt(clusters / (clusters - 1))
     low, high = (
-        table["relative"] + sign * np.hypot((table[end] - table["difference"]) * percent, chance)
+        table["relative"]
+        + sign * np.hypot((table[end] - table["difference"]) * percent * wider, chance)
         for sign, end in ((-1, "ci_low"), (1, "ci_high"))
     )
     verdict = np.select([high < 0, low > 0], ["lower", "higher"], "undecided")

@@ -13,7 +13,7 @@ from dine.config import CONTROL, STAGE1
 from dine.evaluation.statistics import verdicts
 from dine.reporting import tables
 from dine.reporting.tables import CONDITION_NAMES, OBJECTS_NAMES, display_name
-from dine.results import CLEAN, KNOWN, UNSEEN, trained_on
+from dine.results import CLEAN, KNOWN, trained_on
 
 
 def effects(
@@ -41,37 +41,33 @@ def effects(
 
 def interval(row: pd.Series) -> str:
     """A difference in percent of the reference, with its interval."""
-    text = f"{row['relative']:+.0f} % ({row['low']:+.0f} to {row['high']:+.0f})"
-    return text.replace("-", "−")
+    ends = f" ({row['low']:+.0f} to {row['high']:+.0f})" if pd.notna(row["low"]) else ""
+    return f"{row['relative']:+.0f} %{ends}".replace("-", "−")
 
 
 def headlines(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[str]:
-    """A sentence for each kind of objects, prior and reference, on clean targets."""
-    found = []
-    tables_of = {name: effects(metrics, name, spread=spread) for name in (CONTROL, STAGE1)}
-    for objects in (KNOWN, UNSEEN):
-        for reference, table in tables_of.items():
-            some = table[(table["condition"] == CLEAN) & (table["objects"] == objects)]
-            for method, rows in some.groupby("method", sort=False):
-                found.append(_headline(method, objects, reference, rows, metrics))
+    """A sentence for each kind of objects and each prior: against the control, on clean targets."""
+    table = effects(metrics, spread=spread)
+    table = table[table["condition"] == CLEAN]
+    groups = table.groupby(["objects", "method"], sort=False)
+    found = [_headline(method, kind, rows) for (kind, method), rows in groups]
     return found or ["No prior was evaluated in this run, so there is nothing to compare."]
 
 
-def _headline(
-    method: str, objects: str, reference: str, rows: pd.DataFrame, metrics: pd.DataFrame
-) -> str:
+def _headline(method: str, objects: str, rows: pd.DataFrame) -> str:
+    name = display_name(method)
+    words = {
+        "lower": f"{name} has a lower mean Chamfer distance than the control on",
+        "higher": f"{name} has a higher mean Chamfer distance than the control on",
+        "undecided": f"whether {name} differs from the control is undecided on",
+    }
     parts = []
-    for verdict in ("lower", "undecided", "higher"):
+    for verdict, text in words.items():
         some = rows[rows["verdict"] == verdict]
-        places = [f"{_place(row)}: {interval(row)}" for _, row in some.iterrows()]
+        places = [f"{_place(row)} {interval(row)}" for _, row in some.iterrows()]
         if places:
-            parts.append(f"{verdict} on {'; '.join(places)}")
-    origins = {tables.ORIGIN_NAMES[tables.origin_of(name, metrics)] for name in rows["dataset"]}
-    rival = "the control" if reference == CONTROL else display_name(reference)
-    return (
-        f"{OBJECTS_NAMES[objects].capitalize()} ({', '.join(sorted(origins))}), "
-        f"{display_name(method)} against {rival}, mean Chamfer distance: {'. '.join(parts)}."
-    )
+            parts.append(f"{text} {', '.join(places)}")
+    return f"{OBJECTS_NAMES[objects].capitalize()}: {'; '.join(parts)}."
 
 
 def _place(row: pd.Series) -> str:

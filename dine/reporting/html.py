@@ -19,6 +19,7 @@ from dine.files import write_text
 from dine.reporting import tables
 from dine.reporting.effects import headlines, overview
 from dine.reporting.tables import Table, display_name
+from dine.results import trained_on
 
 _PIXELS_PER_DOT = 96 / 150
 
@@ -111,7 +112,9 @@ def render(path: str | os.PathLike, template: str, **values: Any) -> Path:
 
 def origins(metrics: pd.DataFrame) -> list[tuple[str, str, str, bool]]:
     """For the macro ``banners``: each dataset, its origin, and whether the paper has it."""
-    first = metrics.drop_duplicates("dataset")
+    # Unseen objects are of the same making as the known ones.
+    names = metrics["dataset"].map(trained_on)
+    first = metrics.assign(dataset=names).drop_duplicates("dataset")
     return [
         (
             display_name(dataset),
