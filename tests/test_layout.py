@@ -424,6 +424,8 @@ def test_one_of_several_split_files_is_used(make):
         ("split.csv", "", "no rows, or no columns"),
         ("split.csv", "name,part\n1,train\n", "no rows, or no columns"),
         ("split.csv", "name,split\n1\n", "None is none of"),
+        ("split.csv", "level,name,split\n0.1,,train\n", "'' is not a name"),
+        ("split.csv", "split,level,name\ntrain,0.1\n", "None is not a name"),
         ("train.txt", "\n", "train.txt .*holds no names"),
     ],
 )

@@ -317,9 +317,10 @@ def test_what_is_drawn_is_what_the_name_says(tmp_path):
     assert sorted(drawn[:4]) == [(2, 0.3), (2, 0.5), (10, 0.3), (10, 0.5)]
 
 
-def test_ranges_too_narrow_for_the_pairs_are_refused(tmp_path):
-    near = {"control_percents": [5], "widths": [0.3, 0.3001], "pairs_per_level": 3}
-    with pytest.raises(ConfigError, match=r"is 3, but .* so close .* only 2 different deform"):
+@pytest.mark.parametrize(("widest", "found"), [(0.3001, 2), (0.3002, 3)])
+def test_ranges_too_narrow_for_the_pairs_are_refused(tmp_path, widest, found):
+    near = {"control_percents": [5], "widths": [0.3, widest], "pairs_per_level": 4}
+    with pytest.raises(ConfigError, match=f"is 4, but .* so close .* only {found} different defo"):
         write(tmp_path / "d", [("a", ball())], **near)
     assert not (tmp_path / "d").exists()
 

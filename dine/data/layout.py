@@ -706,7 +706,7 @@ def _csv_items(path: Path, text: str) -> list[tuple[Any, Any]]:
     level = columns.get("level")
     return [
         (
-            f"{row[level]}/{row[names]}" if level and row[level] else row[names],
+            f"{row[level]}/{row[names]}" if level and row[level] and row[names] else row[names],
             row[columns["split"]],
         )
         for row in rows

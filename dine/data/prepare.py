@@ -80,7 +80,7 @@ def prepare_pairs(
                 progress=lambda done, total: bar.update(),
             )
             sets.append(pairs)
-    both = set(sets[0].object).intersection(*(other.object for other in sets[1:]))
+    both = set(sets[0].object.tolist()).intersection(*(x.object.tolist() for x in sets[1:]))
     if len(sets) > 1 and both:
         raise DataError(
             f"{unseen} has objects that are in {raw} too, such as {min(both)!r}; unseen objects "

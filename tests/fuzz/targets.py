@@ -433,12 +433,20 @@ def manifest(path: Path) -> None:
         assert os.path.isfile(job.source) in (True, False)  # a name can be too long for one
 
 
-SPLIT = {"train": ["12", "Source_13_5_0.3.ply"], "val": [14], "test": ["15"]}
+SPLIT = {
+    "train": ["12", "Source_13_5_0.3.ply", "Deformation_Level/0.1/Target_12_5_0.3.ply"],
+    "val": [14, "0.1/13_5_0.3"],
+    "test": ["15"],
+}
 
 
 def split_file(path: Path) -> None:
-    for number in range(12, 16):
-        (path.parent / f"{number}.ply").write_bytes(b"")
+    names = [f"Data/{number}" for number in range(12, 16)]
+    names += [f"Deformation_Level/0.1/{role}_12_5_0.3" for role in ("Source", "Target")]
+    for name in names:
+        file = path.parent / f"{name}.ply"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(b"")
     found = scan(path.parent)
     assert set(found.bases) >= {"12", "13", "14", "15"}
     assert found.split is None or set(found.split.values()) <= {"train", "val", "test"}
@@ -653,7 +661,13 @@ TARGETS: dict[str, Target] = {
     "manifest": Target("jobs.csv", lambda: [MANIFEST], m.TEXT, manifest),
     "split_json": Target("split.json", lambda: [json.dumps(SPLIT).encode()], m.JSON, split_file),
     "split_csv": Target(
-        "split.csv", lambda: [b"name,split\n12,train\n13_5_0.3,val\n14,test\n"], m.TEXT, split_file
+        "split.csv",
+        lambda: [
+            b"name,split\n12,train\n13_5_0.3,val\n14,test\n",
+            b"level,name,split\n0.1,12_5_0.3,train\n,13,test\n",
+        ],
+        m.TEXT,
+        split_file,
     ),
     "split_txt": Target("train.txt", lambda: [b"# names\n12\n13\n"], m.TEXT, split_file),
     "raw": Target("raw.json", lambda: [b'{"folder": "data", "origin": "path"}'], m.JSON, raw_facts),

@@ -37,10 +37,7 @@ LARGE = 0.4
 SIGNIFICANT = 0.05
 
 _KEYS = ["dataset", "backbone", "method", "seed", "condition", "corruption", "pair"]
-_TEXT = (
-    *("dataset", "backbone", "method", "origin", "pair", "object", "objects", "cluster"),
-    "condition",
-)
+_TEXT = ("dataset", "backbone", "method", "origin", "pair", "object", "cluster", "condition")
 _NUMBERS = ("seed", "level", "corruption", *statistics.SUMMARISED, "roughness_true")
 # Numbers that evaluate may leave out: unknown level or correspondences, time that was not measured.
 _MAY_LACK = {"level", "seconds", "mce", "accuracy_2_5", "accuracy_5", "far_points"}
