@@ -108,9 +108,12 @@ def test_every_field_becomes_more_probable(pair):
     source, target, _ = pair
     model = Model(source, target, STIFF.at(source), STIFF.least, 0)
     found = [
-        model.rounds(np.zeros_like(source), rounds)[1].improbability for rounds in (1, 5, 20, 40)
+        model.rounds(np.zeros_like(source), rounds)[1].improbability for rounds in (1, 2, 4, 6, 40)
     ]
-    assert found == sorted(found, reverse=True)
+    # Where it has come to rest, rounding may raise it.
+    rise = np.diff(found)
+    assert (rise[:3] < -1).all()
+    assert rise[3] < 1e-6 * abs(found[-1])
 
 
 def test_the_network_is_improved_on(pair):
