@@ -109,9 +109,9 @@ def test_schema_file_is_in_step_with_the_code():
             "backbone 'robust_defreg' on `lambda_search.dataset`, 'synbench', which is not under",
         ),
         (
-            "backbones.robust_defreg_geometric.datasets",
+            "backbones.robust_defreg.datasets",
             ["deformedtissue"],
-            "backbone 'robust_defreg_geometric' on `lambda_search.dataset`",
+            "backbone 'robust_defreg' on `lambda_search.dataset`",
         ),
         (
             "evidence.backbones.robust_defreg_pretrained.own_lambda",
@@ -325,19 +325,29 @@ def test_backbones_may_be_for_some_datasets():
         config.validate(changed("backbones", only))
 
 
+def with_own_search(priors=("pca", "pca_residual"), searched=("pca", "pca_residual", "flow")):
+    change = {
+        "backbones": {"robust_defreg_geometric": {"own_lambda": True, "priors": list(priors)}},
+        "lambda_search": {"priors": list(searched)},
+    }
+    return config.validate(config.merge(DEFAULT, change))
+
+
 def test_each_search_is_for_the_priors_that_it_counts_for():
-    loaded = config.load(ROOT / "config.yaml")
+    own = "robust_defreg_geometric"
+    loaded = with_own_search()
     assert loaded.searched("robust_defreg") == ["pca", "pca_residual", "flow"]
     # The first one is searched whatever is used, as its λ is that of all others.
-    values = changed("lambda_search.priors", ["flow", "pca_residual", "pca"])
-    geometric = config.validate(values).searched("robust_defreg_geometric")
-    assert geometric == ["flow", "pca_residual", "pca"]
-    values = changed("backbones.robust_defreg_geometric.priors", ["pca_residual"])
-    assert config.validate(values).searched("robust_defreg_geometric") == ["pca", "pca_residual"]
+    values = with_own_search(searched=["flow", "pca_residual", "pca"])
+    assert values.searched(own) == ["flow", "pca_residual", "pca"]
+    assert with_own_search(["pca_residual"]).searched(own) == ["pca", "pca_residual"]
     assert loaded.searching("deftransnet") == "robust_defreg"
-    assert loaded.searching("robust_defreg_geometric") == "robust_defreg_geometric"
-    assert own_searches(loaded) == ["robust_defreg_geometric"]
-    assert "lambda_robust_defreg_geometric" in figure_names(loaded)
+    assert loaded.searching(own) == own
+    assert own_searches(loaded) == [own]
+    assert f"lambda_{own}" in figure_names(loaded)
+    # Without, that of all others counts.
+    assert config.validate(DEFAULT).searching(own) == "robust_defreg"
+    assert own_searches(config.validate(DEFAULT)) == []
 
 
 def tables_of(**changes):

@@ -352,47 +352,53 @@ def test_pairs_of_unknown_level_count_in_the_row_of_all():
 # ----------------------------------------------------------------------------------- verdicts
 
 
-def two_objects(seeds=1):
-    """Differences −0.1 and −0.02 of two objects to 0.2: −30 %, from −50 to −10."""
+def six_objects(seeds=1):
+    """Differences −0.1 of three objects and −0.02 of three to 0.2: −30 %."""
     return pd.concat(
         rows(method, mce, seed=seed, per_object=2)
         for seed in range(seeds)
-        for method, mce in (("new", [0.1, 0.1, 0.18, 0.18]), ("old", [0.2] * 4))
+        for method, mce in (("new", [0.1, 0.1, 0.18, 0.18] * 3), ("old", [0.2] * 12))
     )
 
 
 @pytest.mark.parametrize(
-    ("spread", "seeds", "half", "verdict"),
-    [
-        (0.0, 1, 20, "lower"),
-        (0.1, 1, np.hypot(20, 19.6), "lower"),
-        (0.2, 1, np.hypot(20, 39.2), "undecided"),
-        (0.2, 4, np.hypot(20, 19.6), "lower"),
-    ],
+    ("spread", "seeds", "verdict"),
+    [(0.0, 1, "lower"), (0.1, 1, "lower"), (0.2, 1, "undecided"), (0.2, 4, "lower")],
 )
-def test_verdicts_join_the_chance_of_pairs_and_of_training(spread, seeds, half, verdict):
-    found = verdicts(two_objects(seeds), "old", "mce", spread=spread)
+def test_verdicts_join_the_chance_of_pairs_and_of_training(spread, seeds, verdict):
+    metrics = six_objects(seeds)
+    found = verdicts(metrics, "old", "mce", spread=spread)
     row = only(found, level=0.5)
-    assert (row["method"], row["pairs"], row["clusters"]) == ("new", 4, 2)
+    assert (row["method"], row["pairs"], row["clusters"]) == ("new", 12, 6)
     assert row["relative"] == pytest.approx(-30)
-    assert (row["low"], row["high"]) == pytest.approx((-30 - half, -30 + half))
+    # Student's t of 5 degrees of freedom, and a mean of 6.
+    wider = 2.570582 / 1.96 * np.sqrt(6 / 5)
+    drawn = only(compare(metrics, "new", "old", values=("mce",)), level=0.5)
+    training = 196 * spread / np.sqrt(seeds)
+    for end, of_pairs in (("low", "ci_low"), ("high", "ci_high")):
+        half = np.hypot(100 * (drawn[of_pairs] + 0.06) / 0.2 * wider, training)
+        assert abs(row[end] + 30) == pytest.approx(half, rel=1e-5)
+    assert row["low"] < -30 < row["high"]
     assert row["verdict"] == verdict
     assert len(found) == 2
 
 
-def test_verdicts_turn_with_the_reference_and_need_two_clusters():
-    turned = only(verdicts(two_objects(), "new", "mce"), level=0.5)
+def test_verdicts_turn_with_the_reference_and_need_five_clusters():
+    turned = only(verdicts(six_objects(), "new", "mce"), level=0.5)
     assert turned["verdict"] == "higher"
-    one = verdicts(two_objects().assign(cluster="0"), "old", "mce", spread=0.1)
-    assert set(one["verdict"]) == {"undecided"}
-    assert one["low"].isna().all()
+    metrics = six_objects()
+    for lost, decided in ((["5"], True), (["4", "5"], False)):
+        some = metrics[~metrics["cluster"].isin(lost)]
+        found = verdicts(some, "old", "mce")
+        assert set(found["verdict"]) == {"lower" if decided else "undecided"}
+        assert found["low"].isna().all() == (not decided)
 
 
 def test_verdicts_are_of_shared_pairs_and_need_the_reference():
-    metrics = two_objects()
+    metrics = six_objects()
     part = metrics[metrics["method"] == "new"].iloc[2:].assign(method="part")
     found = verdicts(pd.concat([metrics, part]), "old", "mce")
-    assert only(found, level=0.5, method="part")["pairs"] == 2
+    assert only(found, level=0.5, method="part")["pairs"] == 10
     assert verdicts(metrics, "absent", "mce").empty
     elsewhere = metrics[metrics["method"] == "new"].assign(backbone="c")
     assert set(verdicts(pd.concat([metrics, elsewhere]), "old", "mce")["backbone"]) == {"b"}
