@@ -109,11 +109,6 @@ def test_schema_file_is_in_step_with_the_code():
             "backbone 'robust_defreg' on `lambda_search.dataset`, 'synbench', which is not under",
         ),
         (
-            "backbones.robust_defreg.datasets",
-            ["deformedtissue"],
-            "backbone 'robust_defreg' on `lambda_search.dataset`",
-        ),
-        (
             "evidence.backbones.robust_defreg_pretrained.own_lambda",
             True,
             r"robust_defreg_pretrained\.own_lambda` cannot be set",
