@@ -391,7 +391,7 @@ def test_corruption_table_compares_with_the_same_clean_pairs(evidence):
     assert groups == [
         "Noise σ = 0.03 (level 0.6)",
         "25 % outliers (level 0.6)",
-        "Resampled target (level 0.6)",
+        "Other points (level 0.6)",
     ]
     cells = shown(table)["MAP"]
     rows = at(evidence.metrics, place).query("method == 'map' and level == 0.6")

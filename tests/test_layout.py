@@ -362,7 +362,7 @@ def test_split_lists_with_pair_names(make):
             json.dumps(
                 {
                     "train": ["Deformation_Level/0.1/Source_1_5_0.3.ply"],
-                    "test": ["elsewhere\\dataset\\Deformation_Level\\0.2\\Target_1_5_0.3.ply"],
+                    "test": ["noise\\dataset\\Deformation_Level\\0.2\\Target_1_5_0.3.ply"],
                 }
             ),
         ),

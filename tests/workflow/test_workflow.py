@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from dine import config
 from dine.cli import cli
 from dine.data.deformation import rbf_displacement
-from dine.data.pairs import read_pairs
+from dine.data.pairs import read_pairs, read_variant
 from dine.data.readers import read_surface, write_surface
 from dine.data.surface import Surface
 from dine.data.synthetic import primitive
@@ -247,11 +247,22 @@ def test_searches_of_lambda_get_the_files_of_the_priors_that_they_name(tmp_path)
     commands = [line for line in said.splitlines() if " search-lambda " in line]
     assert len(commands) == 2
     for line in commands:
-        given = re.findall(r"--prior (\w+) \S*/(\w+)\.safetensors", line.replace("'", ""))
+        words = shlex.split(line.partition(": ")[2])
+        places = [place for place, word in enumerate(words) if word == "--prior"]
+        given = [(words[place + 1], Path(words[place + 2]).stem) for place in places]
         expected = ["pca", "flow", "pca_residual"]
         if "geometric" in line:  # it has no flow
             expected.remove("flow")
         assert given == [(name, name) for name in expected]
+
+
+def test_calibrations_are_of_all_pairs(tmp_path):
+    folder = copy_workflow(tmp_path)
+    target = Path(RESULTS) / "synbench" / "resampled.h5"
+    snakemake(folder, target, "--configfile", TINY)
+    place = (folder / target).parent
+    targets = read_variant(place / "resampled.h5", read_pairs(place / "pairs.h5"))
+    assert len(targets) == 24  # five of two objects and levels, and one of two unseen objects
 
 
 def test_the_evidence_draws_targets_of_unseen_objects_anew_too(tmp_path):

@@ -169,6 +169,10 @@ def raw_files(wildcards):
     return found
 
 
+def raw_options(wildcards):
+    return options("--raw", raw_files(wildcards).values())
+
+
 def unseen_option(wildcards, input):
     return options("--unseen", [input.unseen]) if "unseen" in input.keys() else ""
 
@@ -270,11 +274,24 @@ def calibrating_prior(wildcards):
     ]
 
 
+def searches_from():
+    """The searches of λ, and all that lies between them and their networks."""
+    found = [*SEARCHES]
+    dataset = CONFIG.lambda_search.dataset
+    for backbone in (CONFIG.lambda_search.backbone, *own_searches(CONFIG)):
+        found.append(FILES.dataset(dataset, f"{backbone}/dvf.h5"))
+        found += [
+            FILES.prior(dataset, backbone, prior) for prior in CONFIG.searched(backbone)
+        ]
+    return found
+
+
 def priors_from(*names):
     """Some files of each dataset, and all that lies between them and the priors."""
-    found = [*SEARCHES]
+    found = searches_from()
     for dataset in CONFIG.datasets:
         found += [FILES.dataset(dataset, name) for name in names]
+        found += raw_files(Namespace(dataset=dataset)).values()
         for backbone in CONFIG.backbones_of(dataset):
             settings = CONFIG.backbones[backbone]
             if settings.priors:
@@ -288,10 +305,7 @@ def priors_from(*names):
 def kept_files():
     """What `all` makes on its way; named as its inputs so that a deleted file is made again."""
     found = [RESULTS / "config.yaml"]
-    found += priors_from("raw.json", "pairs.h5", "agreement.json")
-    for dataset, settings in CONFIG.datasets.items():
-        if settings.unseen:
-            found.append(FILES.dataset(dataset, "unseen/raw.json"))
+    found += priors_from("pairs.h5", "agreement.json")
     found += [
         FILES.variant(dataset, *condition)
         for dataset in CONFIG.datasets
@@ -478,7 +492,7 @@ def cell_predictions(cells):
 
 def evidence_kept():
     """What `evidence` makes on its way; named as its inputs, as those of `all` are."""
-    found = [FILES.prior(*prior) for prior in diagnosed_priors()]
+    found = searches_from() + [FILES.prior(*prior) for prior in diagnosed_priors()]
     for (dataset, backbone, seed), cells in GROUPS.items():
         place = Namespace(dataset=dataset)
         found += [*evidence_raw_files(place), evidence_pairs_file(place)]
@@ -496,7 +510,7 @@ def evidence_kept():
             if prior in CONFIG.priors:
                 found.append(FILES.dataset(trained, f"{folder}/dvf.h5"))
                 found.append(FILES.prior(trained, folder, prior))
-        found.append(FILES.dataset(trained, "raw.json"))
+        found += raw_files(Namespace(dataset=trained)).values()
         found.append(FILES.dataset(trained, "pairs.h5"))
     return list(dict.fromkeys(found))
 

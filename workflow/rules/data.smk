@@ -125,9 +125,7 @@ rule resample:
     resources:
         **request("data"),
     params:
-        raws=lambda wildcards, input: options(
-            "--raw", [input.raw, *([input.unseen] if "unseen" in input.keys() else [])]
-        ),
+        raws=raw_options,
         most=most_option,
         seed=CONFIG.seed,
         code=code_digest("resample"),

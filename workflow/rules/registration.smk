@@ -4,7 +4,7 @@
 # Two scans share no points, so expected errors are learned where targets share none either.
 rule calibration_targets:
     input:
-        raw=rules.raw.output.raw,
+        unpack(raw_files),
         pairs=rules.pairs.output,
     output:
         RESULTS / "{dataset}" / "resampled.h5",
@@ -15,10 +15,11 @@ rule calibration_targets:
     resources:
         **request("data"),
     params:
+        raws=raw_options,
         seed=CONFIG.seed,
         code=code_digest("resample"),
     shell:
-        "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
+        "dine --log {log:q} resample {params.raws} --pairs {input.pairs:q}"
         " --seed {params.seed} --out {output:q}"
 
 
@@ -58,4 +59,4 @@ rule calibrations:
             for run in RUNS
             for name in ("model.safetensors", "calibration.json")
         ],
-        priors_from("raw.json", "pairs.h5", "resampled.h5"),
+        priors_from("pairs.h5", "resampled.h5"),
