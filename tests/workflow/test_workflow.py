@@ -237,7 +237,11 @@ def test_the_evidence_is_planned_from_its_config(tmp_path):
 
 def test_searches_of_lambda_get_the_files_of_the_priors_that_they_name(tmp_path):
     folder = copy_workflow(tmp_path)
-    search = {"lambda_search": {"priors": ["pca", "flow", "pca_residual"]}}
+    own = {"kind": "robust_defreg", "priors": ["pca", "pca_residual"], "own_lambda": True}
+    search = {
+        "lambda_search": {"priors": ["pca", "flow", "pca_residual"]},
+        "backbones": {"robust_defreg_geometric": own},
+    }
     said = snakemake(folder, "-n", "-p", *changed(folder, search)).stdout
     commands = [line for line in said.splitlines() if " search-lambda " in line]
     assert len(commands) == 2
