@@ -39,6 +39,7 @@ FILES = Results(RESULTS)
 FIGURES = figure_names(CONFIG)
 TABLES = table_names(CONFIG)
 RUNS = runs(CONFIG)
+SEARCH = CONFIG.lambda_search
 SEARCHES = [FILES.search, *(FILES.search_of(name) for name in own_searches(CONFIG))]
 # Once: to look through all of them for each job would take minutes for thousands of jobs.
 GROUPS = evidence_groups(CONFIG)
@@ -225,6 +226,19 @@ def backbone_settings(wildcards):
     return json.dumps(
         {"kind": backbone.kind, "arguments": backbone.arguments}, sort_keys=True
     )
+
+
+def search_settings(backbone):
+    changes = {"backbone": backbone, "priors": CONFIG.searched(backbone)}
+    return section(SEARCH.model_copy(update=changes))
+
+
+def searched_priors(backbone):
+    """Files of the priors, in the order in which they are searched."""
+    return [
+        FILES.prior(SEARCH.dataset, backbone, prior)
+        for prior in CONFIG.searched(backbone)
+    ]
 
 
 def search_file(wildcards):

@@ -25,22 +25,6 @@ rule fit_prior:
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
 
 
-SEARCH = CONFIG.lambda_search
-
-
-def search_settings(backbone):
-    changes = {"backbone": backbone, "priors": CONFIG.searched(backbone)}
-    return section(SEARCH.model_copy(update=changes))
-
-
-def searched_priors(backbone):
-    """Files of the priors, in the order in which they are searched."""
-    return [
-        FILES.prior(SEARCH.dataset, backbone, prior)
-        for prior in CONFIG.searched(backbone)
-    ]
-
-
 rule search_lambda:
     input:
         pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
