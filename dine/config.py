@@ -184,7 +184,7 @@ class Dataset(Section):
         if self.source.kind != "synthetic" and self.unseen.folder is None:
             raise ValueError(
                 f"`unseen.folder` is needed when `source.kind` is {self.source.kind}: a folder of "
-                "objects that are not in the dataset"
+                "objects that are not in the dataset (or `unseen: null`)"
             )
         if self.source.kind == "synthetic" and self.unseen.folder is not None:
             raise ValueError(

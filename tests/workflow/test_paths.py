@@ -68,7 +68,11 @@ def test_the_workflow_takes_any_name(name, tmp_path):
         "datasets": {
             "synbench": {
                 "source": {"kind": "path", "folder": str(place)},
-                "pairs": {"points": 32, "split": {"train": 0.4, "val": 0.3, "test": 0.3}},
+                "pairs": {
+                    "points": 32,
+                    "split": {"by": "object", "train": 0.4, "val": 0.3, "test": 0.3},
+                },
+                "unseen": None,
             }
         },
     }
