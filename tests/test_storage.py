@@ -41,7 +41,7 @@ COMMANDS = {
     "fit-prior": ("fit-prior", "--settings", '{"kind": "pca"}'),
     "search-lambda": (
         *("search-lambda", "--stage2", STAGE2),
-        *("--settings", '{"candidates": [0.001], "steps": 2, "validation_pairs": 1}'),
+        *("--settings", '{"candidates": [0.001], "extend": 0, "steps": 2, "validation_pairs": 1}'),
     ),
     "stage2": ("stage2", "--variant", "pca", "--lambda", 0.1, "--settings", STAGE2),
     "predict": ("predict",),
