@@ -68,12 +68,16 @@ def main(folders: list[Path]) -> int:
                 OBJECTS_NAMES[place[0]],
                 display_name(trained_on(place[1])),
                 *map(display_name, place[2:]),
-                *(f"{row['relative']:+.0f} %{MARKS[row['verdict']]}" for row in rows),
+                *(f"{signed(row['relative'])} %{MARKS[row['verdict']]}" for row in rows),
                 f"{spreads[-1]:.0f}",
             ]
-            print(f"| {' | '.join(cells)} |".replace("-", "−"))
+            print(f"| {' | '.join(cells)} |")
         print(f"\nStandard deviation over runs, root mean square: {rms(spreads):.0f} %\n")
     return contradictions([table for _, _, table in found])
+
+
+def signed(percent: float) -> str:
+    return f"{percent:+.0f}".replace("-", "−")
 
 
 def rms(values: list[float]) -> float:

@@ -93,6 +93,11 @@ def test_schema_file_is_in_step_with_the_code():
         ("datasets.synbench.unseen.folder", "x", "`unseen.folder` is not used when"),
         ("datasets.synbench.unseen.objects", 0, r"`datasets\.synbench\.unseen\.objects` is 0"),
         ("datasets.liver_unseen", {}, "cannot be called 'liver_unseen'; the ending stands for"),
+        (
+            "evidence.test_sets.real_unseen",
+            {"folder": "pairs.csv", "networks": "synbench"},
+            "cannot be called 'real_unseen'; the ending stands for",
+        ),
         ("lambda_search.candidates", [1.0e-4], "holds the single value 0.0001, which nothing is"),
         ("lambda_search.candidates", [1.0e-4, 1.0e-4], "`candidates` holds a value twice"),
         ("lambda_search.extend", -1, r"`lambda_search\.extend` is -1"),
