@@ -195,18 +195,18 @@ def test_headlines_say_what_the_interval_allows(gain, spread, said, interval):
     (sentence,) = headlines(even(gain), spread=spread)
     change = f"{-100 * gain:+.0f}".replace("-", "−")
     place = "DeformedTissue with Robust-DefReg"
-    assert sentence == f"Known objects: {said} on {place} {change} % ({interval})."
+    assert sentence == f"Known objects (synthetic data): {said} on {place} {change} % ({interval})."
 
 
 def test_known_objects_come_first_and_each_prior_has_a_sentence():
     unseen = even(-0.5, objects="unseen", dataset="deformedtissue_unseen")
     other = even(0.25, method="flow", backbone="deftransnet")
     found = headlines(pd.concat([unseen, other, even(0.25)]))
-    beginnings = [" ".join(sentence.split()[:5]) for sentence in found]
+    beginnings = [" ".join(sentence.split()[:7]) for sentence in found]
     assert beginnings == [
-        "Known objects: DINE-PCA has a",
-        "Known objects: DINE-Flow has a",
-        "Unseen objects: DINE-PCA has a",
+        "Known objects (synthetic data): DINE-PCA has a",
+        "Known objects (synthetic data): DINE-Flow has a",
+        "Unseen objects (synthetic data): DINE-PCA has a",
     ]
     assert "higher mean Chamfer distance than the control on DeformedTissue" in found[-1]
 

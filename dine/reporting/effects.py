@@ -50,11 +50,11 @@ def headlines(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[str]:
     table = effects(metrics, spread=spread)
     table = table[table["condition"] == CLEAN]
     groups = table.groupby(["objects", "method"], sort=False)
-    found = [_headline(method, kind, rows) for (kind, method), rows in groups]
+    found = [_headline(method, kind, rows, metrics) for (kind, method), rows in groups]
     return found or ["No prior was evaluated in this run, so there is nothing to compare."]
 
 
-def _headline(method: str, objects: str, rows: pd.DataFrame) -> str:
+def _headline(method: str, objects: str, rows: pd.DataFrame, metrics: pd.DataFrame) -> str:
     name = display_name(method)
     words = {
         "lower": f"{name} has a lower mean Chamfer distance than the control on",
@@ -67,7 +67,9 @@ def _headline(method: str, objects: str, rows: pd.DataFrame) -> str:
         places = [f"{_place(row)} {interval(row)}" for _, row in some.iterrows()]
         if places:
             parts.append(f"{text} {', '.join(places)}")
-    return f"{OBJECTS_NAMES[objects].capitalize()}: {'; '.join(parts)}."
+    made = {tables.ORIGIN_NAMES[tables.origin_of(name, metrics)] for name in rows["dataset"]}
+    kind = f"{OBJECTS_NAMES[objects].capitalize()} ({', '.join(sorted(made))})"
+    return f"{kind}: {'; '.join(parts)}."
 
 
 def _place(row: pd.Series) -> str:
