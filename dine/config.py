@@ -378,6 +378,14 @@ class Pretraining(Training):
     """Share of the steps whose source is cut down to a part, as scans often show one."""
     objects: Count = 240
     """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
+    amplitude: Positive = 0.15
+    """Of their deformations, as in `recipe`: somewhat harder than the default datasets."""
+    levels: dict[Literal["primitives", "tissue"], list[Positive]] = {
+        "primitives": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8],
+        "tissue": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7],
+    }
+    """Levels of deformation of each shape."""
+    split: Split = Split(train=0.9, val=0.05, test=0.05)
 
 
 class Method(Section):

@@ -173,7 +173,7 @@ def _add_data(file: Path, found: dict[str, Path]) -> None:
 
 @functools.cache
 def _parsed(file: Path) -> ast.Module:
-    """The syntax tree of a module, without docstrings and other strings that nothing is done with."""
+    """The syntax tree of a module, without docstrings and other statements that are mere text."""
     try:
         tree = ast.parse(file.read_bytes(), str(file))
     except (OSError, SyntaxError, ValueError) as error:

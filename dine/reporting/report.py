@@ -19,12 +19,12 @@ def build_report(results: Path, config: Config, out: Path) -> None:
     """Write the HTML report of a run whose figures are drawn."""
     run = Run(results, config)
     agreement = pd.DataFrame(
-        {"dataset": display_name(dataset)} | read_json(run.files.dataset(dataset, "agreement.json"))
+        {"dataset": display_name(dataset)} | read_json(run.files.data(dataset).agreement)
         for dataset in config.datasets
     )
     seconds, made = {}, {}
     for dataset, backbone, method in runs(config):
-        record = read_json(run.files.run(dataset, backbone, method, "run.json"))
+        record = read_json(run.files.run(dataset, backbone, method).record)
         made = record.get("made", made)
         stage = "Stage 1" if method == STAGE1 else "Stage 2"
         label = (
