@@ -1,8 +1,11 @@
+from pathlib import Path
+
 from snakemake.utils import min_version
 
 min_version("9.19")
 
 
+configfile: Path(workflow.basedir) / "config" / "evidence.yaml"
 configfile: "config.yaml"
 
 
