@@ -3,9 +3,10 @@
     python benchmarks/spread.py results run-of-another-seed/results … > spread.md
 
 Each argument is the results folder of a finished run. Printed as Markdown: how each run was made;
-for each prior, dataset and backbone the difference of its mean Chamfer distance to the control's,
-run by run, with the verdict; and the standard deviation over runs, which is what
-`evaluation.training_spread` stands for. Ends with 1 if one run says lower and another higher.
+mean Chamfer distances over all runs, and what all of them say of each prior; for each prior,
+dataset and backbone the difference of its mean Chamfer distance to the control's, run by run, with
+the verdict; and the standard deviation over runs, which is what `evaluation.training_spread` stands
+for. Ends with 1 if one run says lower and another higher.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import pandas as pd
 from dine import config as dine_config
 from dine.files import read_json
 from dine.reporting.effects import effects
-from dine.reporting.tables import OBJECTS_NAMES, display_name, load_metrics
+from dine.reporting.tables import METHOD_NAMES, OBJECTS_NAMES, display_name, load_metrics
 from dine.results import CLEAN, Results, runs, trained_on
 
 KEYS = ["objects", "dataset", "backbone", "method"]
@@ -51,6 +52,7 @@ def main(folders: list[Path]) -> int:
         ]
         print(f"| {number} | {' | '.join(cells)} |")
     print()
+    summary(found)
     numbers = range(1, len(found) + 1)
     for condition in (CLEAN, "outliers", "noise", "resampled"):
         tables = [table[table["condition"] == condition].set_index(KEYS) for _, _, table in found]
@@ -74,6 +76,40 @@ def main(folders: list[Path]) -> int:
             print(f"| {' | '.join(cells)} |")
         print(f"\nStandard deviation over runs, root mean square: {rms(spreads):.0f} %\n")
     return contradictions([table for _, _, table in found])
+
+
+def summary(found: list[tuple[dict[str, str], pd.DataFrame, pd.DataFrame]]) -> None:
+    """Print mean Chamfer distances over the runs, and what every one of them says of the priors."""
+    places = ["objects", "dataset", "backbone"]
+    clean = [metrics[metrics["condition"] == CLEAN] for _, metrics, _ in found]
+    means = [x.groupby([*places, "method"])["cd"].mean().unstack("method") * 1e4 for x in clean]
+    every = pd.concat(means).groupby(level=places, sort=False)
+    verdicts = pd.concat([table[table["condition"] == CLEAN] for _, _, table in found])
+    said = verdicts.groupby([*places, "method"])["verdict"].agg(set)
+    order = [name for name in METHOD_NAMES if name in means[0]]
+    print(f"| objects | dataset | backbone | {' | '.join(map(display_name, order))} |")
+    print(f"|{'---|' * (3 + len(order))}")
+    low, middle, high = every.min(), every.mean(), every.max()
+    for place in means[0].index:
+        cells = []
+        for name in order:
+            if np.isnan(middle.loc[place, name]):
+                cells.append("–")
+                continue
+            ends = f"{low.loc[place, name]:.1f}–{high.loc[place, name]:.1f}"
+            words = said.get((*place, name))
+            agreed = "" if words is None else f", {words.pop() if len(words) == 1 else 'undecided'}"
+            cells.append(f"{middle.loc[place, name]:.1f} ({ends}){agreed}")
+        names = [
+            OBJECTS_NAMES[place[0]],
+            display_name(trained_on(place[1])),
+            display_name(place[2]),
+        ]
+        print(f"| {' | '.join([*names, *cells])} |")
+    print(
+        "\nMean Chamfer distance ×1e-4 over all levels and runs; in brackets the least and most of a run."
+    )
+    print("Against the control: lower or higher in every run, or else undecided.\n")
 
 
 def signed(percent: float) -> str:
