@@ -183,6 +183,7 @@ def plans(undisturbed, tmp_path_factory) -> dict[str, Counter]:
 
     def plan(name):
         place = undisturbed.finished.copy(tmp_path_factory.mktemp("edited"))
+        place.warm = True
         EDITS[name][0](place)
         jobs = planned(place)
         shutil.rmtree(place.folder)

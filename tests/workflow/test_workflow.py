@@ -1,6 +1,7 @@
 """The workflow as a user runs it: one tiny run of everything, then what each change reruns."""
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -13,6 +14,7 @@ import pandas as pd
 import pytest
 import yaml
 from click.testing import CliRunner
+from workplace import warm
 
 from dine import config
 from dine.cli import cli
@@ -33,6 +35,7 @@ def snakemake(folder, *arguments, check=True):
     done = subprocess.run(
         [sys.executable, "-m", "snakemake", "-j2", *map(str, arguments)],
         cwd=folder,
+        env=os.environ | warm(),
         capture_output=True,
         text=True,
     )

@@ -1,10 +1,14 @@
 """A folder to run the workflow in, and what two runs must have in common."""
 
+import atexit
+import functools
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,6 +28,25 @@ class Job(NamedTuple):
     process: psutil.Process
 
 
+@functools.cache
+def warm() -> dict[str, str]:
+    """Variables with which ``dine`` and Snakemake start as forks of a server; it ends with us."""
+    folder = Path(tempfile.mkdtemp(prefix="dine-warm-"))  # addresses of sockets must be short
+    atexit.register(shutil.rmtree, folder)
+    server = subprocess.Popen(
+        [sys.executable, str(HERE / "warm" / "sitecustomize.py"), str(folder / "socket")],
+        stdin=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    atexit.register(server.communicate)
+    while not (folder / "socket").exists():
+        if server.poll() is not None:
+            raise AssertionError(f"The server ended with {server.returncode}.")
+        time.sleep(0.02)
+    return {"DINE_WARM": str(folder / "socket"), "PYTHONPATH": str(HERE / "warm")}
+
+
 class Workplace:
     """A copy of the workflow with a user's own meshes, and their own package in ``code/``."""
 
@@ -31,6 +54,7 @@ class Workplace:
         self.folder = folder
         self.package = package
         self.trace: Path | None = None
+        self.warm = False
         self.configs = [Path(path.name) for path in configs]
         for name in ("Snakefile", "config.yaml"):
             shutil.copy(ROOT / name, folder)
@@ -71,6 +95,9 @@ class Workplace:
         if self.trace:
             path.insert(0, str(HERE / "trace"))
             extra["DINE_TRACE"] = str(self.trace)
+        elif self.warm:
+            path.append(warm()["PYTHONPATH"])
+            extra["DINE_WARM"] = warm()["DINE_WARM"]
         return os.environ | extra | {"PYTHONPATH": os.pathsep.join(path)}
 
     def call(self, *command: str) -> subprocess.CompletedProcess:
