@@ -21,6 +21,18 @@ import threading
 import traceback
 from pathlib import Path
 
+# What `dine` and Snakemake import when they run.
+LIBRARIES = (
+    "docutils.core",
+    "sklearn.decomposition",
+    "sklearn.isotonic",
+    "smart_open",
+    "snakemake.cli",
+    "snakemake.report.html_reporter",
+    "torch._dynamo",
+    "yte",
+    "zuko",
+)
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SNAKEMAKE = ["-m", "snakemake"]
 
@@ -136,8 +148,6 @@ def warm():
             importlib.import_module(name)
     gc.freeze()  # memory that nothing writes to is shared
 
-
-LIBRARIES = ("snakemake.cli",)
 
 if __name__ == "__main__":
     warm()
