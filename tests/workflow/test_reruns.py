@@ -13,6 +13,9 @@ from workplace import ROOT, Workplace, command_of
 
 from dine import provenance
 
+# With the other file that needs the undisturbed run, which takes a minute.
+pytestmark = pytest.mark.xdist_group("undisturbed")
+
 ALL = Counter(
     stage1=1,
     fields=1,
