@@ -139,13 +139,15 @@ def leave(code):
 
 
 def warm():
-    """Import what jobs and Snakemake do; nothing is computed, so no threads are started."""
+    """Import what jobs and Snakemake do, and start no thread."""
     import dine
+    import numba
 
     found = [module.name for module in pkgutil.walk_packages(dine.__path__, "dine.")]
     for name in [*found, *LIBRARIES]:
         if not name.endswith("__main__"):
             importlib.import_module(name)
+    numba.njit(lambda: None)()  # the rest of its modules
     gc.freeze()  # memory that nothing writes to is shared
 
 
