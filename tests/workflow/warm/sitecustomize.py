@@ -140,8 +140,9 @@ def leave(code):
 
 def warm():
     """Import what jobs and Snakemake do, and start no thread."""
-    import dine
     import numba
+
+    import dine
 
     found = [module.name for module in pkgutil.walk_packages(dine.__path__, "dine.")]
     for name in [*found, *LIBRARIES]:
