@@ -99,7 +99,7 @@ def test_everything_is_there(finished):
     for table in tables:
         assert (results / "tables" / f"{table}.md").stat().st_size > 0
         assert (results / "tables" / f"{table}.tex").stat().st_size > 0
-    assert len(list((results / "figures").glob("*.png"))) == 25
+    assert len(list((results / "figures").glob("*.png"))) == 20
     report = (results / "report.html").read_text()
     assert "synthetic" in report
     assert not re.search(r"(src|href)=.https?:", report)
