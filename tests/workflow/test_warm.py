@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from workplace import warm
+from workplace import WARM, warm
 
 SCRIPT = """
 import atexit, json, os, signal, sys, threading, time
@@ -41,8 +41,7 @@ def start(tmp_path):
         (tmp_path / "path" / "of_the_path.py").touch()
         extra = {"OF_TEST": "ü\udcff", "PYTHONPATH": str(tmp_path / "path")}
         if is_warm:
-            path = os.pathsep.join([extra["PYTHONPATH"], warm()["PYTHONPATH"]])
-            extra |= warm() | {"PYTHONPATH": path}
+            extra |= warm() | {"PYTHONPATH": f"{extra['PYTHONPATH']}{os.pathsep}{WARM}"}
         return subprocess.Popen(
             [sys.executable, tmp_path / "bin" / "dine", *arguments],
             cwd=tmp_path / "folder ü",

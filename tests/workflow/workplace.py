@@ -20,6 +20,7 @@ from dine.files import read_json
 
 ROOT = Path(__file__).parents[2]
 HERE = Path(__file__).parent
+WARM = HERE / "warm"
 EXAMPLES = ROOT / "examples" / "extending"
 
 
@@ -34,7 +35,7 @@ def warm() -> dict[str, str]:
     folder = Path(tempfile.mkdtemp(prefix="dine-warm-"))  # addresses of sockets must be short
     atexit.register(shutil.rmtree, folder)
     server = subprocess.Popen(
-        [sys.executable, str(HERE / "warm" / "sitecustomize.py"), str(folder / "socket")],
+        [sys.executable, str(WARM / "sitecustomize.py"), str(folder / "socket")],
         stdin=subprocess.PIPE,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         start_new_session=True,
@@ -44,7 +45,8 @@ def warm() -> dict[str, str]:
         if server.poll() is not None:
             raise AssertionError(f"The server ended with {server.returncode}.")
         time.sleep(0.02)
-    return {"DINE_WARM": str(folder / "socket"), "PYTHONPATH": str(HERE / "warm")}
+    path = filter(None, [str(WARM), os.environ.get("PYTHONPATH")])
+    return {"DINE_WARM": str(folder / "socket"), "PYTHONPATH": os.pathsep.join(path)}
 
 
 class Workplace:
@@ -96,7 +98,7 @@ class Workplace:
             path.insert(0, str(HERE / "trace"))
             extra["DINE_TRACE"] = str(self.trace)
         elif self.warm:
-            path.append(warm()["PYTHONPATH"])
+            path.append(str(WARM))
             extra["DINE_WARM"] = warm()["DINE_WARM"]
         return os.environ | extra | {"PYTHONPATH": os.pathsep.join(path)}
 
