@@ -3,6 +3,7 @@
 import json
 import os
 import platform
+import re
 import shutil
 import signal
 import subprocess
@@ -175,14 +176,26 @@ def test_precision_is_recorded_and_part_of_the_identity(chain, tmp_path):
     assert 0 < np.abs(reduced - exact).max() < 0.5
 
 
-def training_command(chain, out, steps=40, processes=1):
+PYTHON = (sys.executable, "-m", "dine")
+
+
+def training_arguments(chain, out, steps=16, processes=1):
     settings = json.loads(STAGE1) | {"steps": steps, "batch_size": 2, "save_seconds": 0.001}
     settings["validate_every"] = settings["steps"]
     return [
-        *(sys.executable, "-m", "dine", "--threads", "1", "stage1", "--out", out),
+        *("--threads", "1", "stage1", "--out", out),
         *("--pairs", chain / "pairs.h5", "--settings", json.dumps(settings)),
         *("--device", "cpu", "--processes", str(processes)),
     ]
+
+
+@pytest.fixture
+def one_thread(monkeypatch):
+    """What ``--threads 1`` sets in this process is as before in the end."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
 
 
 def wait_for(path, there=True):
@@ -206,9 +219,11 @@ def interrupted(command, out, kill):
 
 
 @pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.usefixtures("one_thread")
 def test_a_training_killed_again_and_again_is_resumed_bit_for_bit(chain, tmp_path, processes):
     out, whole = tmp_path / "killed", tmp_path / "whole"
-    command = training_command(chain, out, processes=processes)
+    arguments = training_arguments(chain, out, processes=processes)
+    command = [*PYTHON, *arguments]
     started = []
 
     def kill_first(process):
@@ -227,19 +242,20 @@ def test_a_training_killed_again_and_again_is_resumed_bit_for_bit(chain, tmp_pat
         assert ("run the same command again" in said) == (number == signal.SIGTERM)
         started.append(said)
         assert not (out / "model.safetensors").exists()
-    started.append(subprocess.run(command, stderr=subprocess.PIPE, text=True).stderr)
+    started.append(dine(*arguments).output)
     went_on = ["going on from step" in said for said in started]
     assert went_on == [False] + [True] * (len(started) - 1)
-    command = training_command(chain, whole, processes=processes)
-    subprocess.run(command, check=True, stderr=subprocess.DEVNULL)
+    dine(*training_arguments(chain, whole, processes=processes))
     expected = (whole / "model.safetensors").read_bytes()
     assert (out / "model.safetensors").read_bytes() == expected
     assert read_json(whole / "run.json")["processes"] == processes
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_an_orphan_holds_its_folder_until_it_ends(chain, tmp_path):
     out = tmp_path / "run"
-    command = training_command(chain, out, steps=10**6)
+    arguments = training_arguments(chain, out, steps=10**6)
+    command = [*PYTHON, *arguments]
     parent = [sys.executable, "-c", "import subprocess, sys; subprocess.run(sys.argv[1:])"]
     started = subprocess.Popen([*parent, *command], stderr=subprocess.DEVNULL)
     wait_for(out / "training" / "state.pt")
@@ -248,9 +264,9 @@ def test_an_orphan_holds_its_folder_until_it_ends(chain, tmp_path):
     holder = out / "training" / "lock.holder"
     number = int(holder.read_text().split()[1])
     try:
-        refused = subprocess.run(command, stderr=subprocess.PIPE, text=True)
-        assert refused.returncode == 1
-        assert f"is in use by process {number} on {platform.node()}; wait for it" in refused.stderr
+        said = f"is in use by process {number} on {platform.node()}; wait for it"
+        with pytest.raises(DineError, match=re.escape(said)):
+            dine(*arguments)
     finally:
         os.kill(number, signal.SIGTERM)
     wait_for(holder, there=False)
@@ -285,14 +301,17 @@ def test_results_that_are_no_longer_asked_for_are_not_written(chain, tmp_path, m
 FLOW = {"kind": "flow", "arguments": {"steps": 100000, "hidden": 8, "transforms": 2}}
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_the_fit_of_a_flow_is_a_training(chain, tmp_path):
     out, folder = tmp_path / "flow.safetensors", tmp_path / "training" / "flow"
-    command = [sys.executable, "-m", "dine", "--threads", "1", "fit-prior", "--out", out]
-    command += ["--fields", chain / "dvf.h5", "--settings", json.dumps(FLOW)]
+    arguments = ["--threads", "1", "fit-prior", "--out", out]
+    arguments += ["--fields", chain / "dvf.h5", "--settings", json.dumps(FLOW)]
+    command = [*PYTHON, *arguments]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     wait_for(folder / "lock.holder")
-    refused = subprocess.run(command, stderr=subprocess.PIPE, text=True)
-    assert f"{folder} is in use by process {process.pid} on" in refused.stderr
+    said = re.escape(f"{folder} is in use by process {process.pid} on")
+    with pytest.raises(DineError, match=said):
+        dine(*arguments)
     process.terminate()
     assert "flow prior was stopped after step" in process.communicate(timeout=300)[1]
     step = torch.load(folder / "state.pt", weights_only=True)["step"]

@@ -78,7 +78,27 @@ def wilcoxon(differences: np.ndarray) -> float:
     differences = differences[differences != 0]
     if len(differences) == 0:
         return 1.0
+    ranks = stats.rankdata(np.abs(differences))
+    if len(ranks) <= 13 and len(np.unique(ranks)) < len(ranks):
+        return _over_all_signs(ranks, differences > 0)
     return float(stats.wilcoxon(differences).pvalue)
+
+
+def _over_all_signs(ranks: np.ndarray, positive: np.ndarray) -> float:
+    """Two-sided p-value of the sum of ``ranks`` (P,) that are ``positive``, among all 2^P choices.
+
+    That of scipy, which tries one after another and takes a hundred times as long.
+    """
+    doubled = np.rint(2 * ranks).astype(int)  # shared ranks are halves
+    counts = np.ones(1)  # of the choices with each sum
+    for rank in doubled:
+        added = np.zeros(len(counts) + rank)
+        added[: len(counts)] = counts
+        added[rank:] += counts
+        counts = added
+    observed = doubled[positive].sum()
+    tail = min(counts[: observed + 1].sum(), counts[observed:].sum())
+    return float(min(1, 2 * tail / counts.sum()))
 
 
 def cluster_bootstrap(

@@ -6,6 +6,9 @@ import pytest
 from kills import Kill, finish, perform
 from workplace import differences
 
+# With the other file that needs the undisturbed run, which takes a minute.
+pytestmark = pytest.mark.xdist_group("undisturbed")
+
 # Each at another stage of a job: Python starting, computing, writing.
 KILLS = [
     Kill("raw", "group", signal.SIGKILL, 1.0),
@@ -21,6 +24,7 @@ def killed(undisturbed):
     """The run of ``undisturbed`` again, one job at a time, with kills; the command's last words."""
     for kill in KILLS:
         assert perform(undisturbed.place, kill, ["all"], cores=1), kill
+    undisturbed.place.warm = True  # nothing is killed any more
     return finish(undisturbed.place, ["all"], cores=1)
 
 

@@ -13,6 +13,9 @@ from workplace import ROOT, Workplace, command_of
 
 from dine import provenance
 
+# With the other file that needs the undisturbed run, which takes a minute.
+pytestmark = pytest.mark.xdist_group("undisturbed")
+
 ALL = Counter(
     stage1=1,
     fields=1,
@@ -183,6 +186,7 @@ def plans(undisturbed, tmp_path_factory) -> dict[str, Counter]:
 
     def plan(name):
         place = undisturbed.finished.copy(tmp_path_factory.mktemp("edited"))
+        place.warm = True
         EDITS[name][0](place)
         jobs = planned(place)
         shutil.rmtree(place.folder)

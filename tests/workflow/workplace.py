@@ -1,10 +1,14 @@
 """A folder to run the workflow in, and what two runs must have in common."""
 
+import atexit
+import functools
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,12 +20,33 @@ from dine.files import read_json
 
 ROOT = Path(__file__).parents[2]
 HERE = Path(__file__).parent
+WARM = HERE / "warm"
 EXAMPLES = ROOT / "examples" / "extending"
 
 
 class Job(NamedTuple):
     step: str
     process: psutil.Process
+
+
+@functools.cache
+def warm() -> dict[str, str]:
+    """Variables with which ``dine`` and Snakemake start as forks of a server; it ends with us."""
+    folder = Path(tempfile.mkdtemp(prefix="dine-warm-"))  # addresses of sockets must be short
+    atexit.register(shutil.rmtree, folder)
+    server = subprocess.Popen(
+        [sys.executable, str(WARM / "sitecustomize.py"), str(folder / "socket")],
+        stdin=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    atexit.register(server.communicate)
+    while not (folder / "socket").exists():
+        if server.poll() is not None:
+            raise AssertionError(f"The server ended with {server.returncode}.")
+        time.sleep(0.02)
+    path = filter(None, [str(WARM), os.environ.get("PYTHONPATH")])
+    return {"DINE_WARM": str(folder / "socket"), "PYTHONPATH": os.pathsep.join(path)}
 
 
 class Workplace:
@@ -31,6 +56,7 @@ class Workplace:
         self.folder = folder
         self.package = package
         self.trace: Path | None = None
+        self.warm = False
         self.configs = [Path(path.name) for path in configs]
         for name in ("Snakefile", "config.yaml"):
             shutil.copy(ROOT / name, folder)
@@ -71,6 +97,9 @@ class Workplace:
         if self.trace:
             path.insert(0, str(HERE / "trace"))
             extra["DINE_TRACE"] = str(self.trace)
+        elif self.warm:
+            path.append(str(WARM))
+            extra["DINE_WARM"] = warm()["DINE_WARM"]
         return os.environ | extra | {"PYTHONPATH": os.pathsep.join(path)}
 
     def call(self, *command: str) -> subprocess.CompletedProcess:
