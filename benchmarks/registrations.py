@@ -32,8 +32,8 @@ import torch
 
 from dine.data.deformation import rbf_displacement
 from dine.data.pairs import read_pairs
-from dine.data.readers import read_surface
-from dine.data.surface import Surface
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
 from dine.registration.frame import transformed
 from dine.registration.register import Model, load_model, register
 

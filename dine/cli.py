@@ -886,7 +886,7 @@ def register(
     Beside the moved source OUT go the displacement of every vertex (OUT.field.npz, OUT.field.vtp),
     a report (OUT.json) and, with --view, a page to look at (OUT.html).
     """
-    from dine.data.readers import read_surface
+    from dine.io.readers import read_surface
     from dine.registration.output import Outputs, save
     from dine.registration.register import register as run
     from dine.registration.register import shapes_by_name

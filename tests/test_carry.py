@@ -4,9 +4,9 @@ from scipy.spatial.transform import Rotation
 
 from dine.data.deformation import rbf_displacement
 from dine.data.sampling import sample_surface
-from dine.data.surface import Surface
 from dine.data.synthetic import primitive, tissue_patch
 from dine.errors import DataError
+from dine.geometry.surface import Surface
 from dine.registration import carry as module
 from dine.registration.carry import carry
 

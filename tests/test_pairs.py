@@ -22,9 +22,10 @@ from dine.data.pairs import (
     write_variant,
 )
 from dine.data.prepare import make_pairs
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 
 pytestmark = pytest.mark.numerical
 POINTS = 64

@@ -12,10 +12,11 @@ from click.testing import CliRunner
 import dine
 from dine.cli import cli
 from dine.data.pairs import PAIR_DATASETS, PairSet, Variant, read_pairs, write_pairs, write_variant
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.evaluation.quality import fit, folding, landmark_errors
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior

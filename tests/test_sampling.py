@@ -11,8 +11,8 @@ from dine.data.sampling import (
     sample_surface,
     sunflower_disc,
 )
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
 
 pytestmark = pytest.mark.numerical
 

@@ -7,9 +7,9 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from dine.data.surface import Surface
 from dine.data.synthetic import primitive
 from dine.errors import DataError, StorageError
+from dine.geometry.surface import Surface
 from dine.registration.view import write_view
 
 SOURCE = primitive(0, 0)

@@ -32,8 +32,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from dine.data.sampling import sample_surface
-from dine.data.surface import Surface
 from dine.errors import DataError
+from dine.geometry.surface import Surface
 
 # Kernel values held at once (8 MiB of float64), whatever the number of vertices.
 _CHUNK = 1 << 20

@@ -50,11 +50,11 @@ import numpy as np
 import scipy
 
 from dine import __version__
-from dine.data import announced
 from dine.data.names import deformation_of
 from dine.data.sampling import SurfaceSamples
 from dine.errors import ConfigError, DataError
 from dine.files import atomic_path, digest
+from dine.io import announced
 
 PAIRS_FORMAT = "dine-pairs"
 VARIANT_FORMAT = "dine-variant"

@@ -29,16 +29,16 @@ from dine.data.pairs import (
     write_pairs,
     write_variant,
 )
-from dine.data.readers import read_surface
 from dine.data.sampling import (
     SurfaceSamples,
     convention_order,
     neighbourhood_agreement,
     sample_surface,
 )
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
 from dine.files import digest
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
 from dine.progress import Progress
 
 _log = logging.getLogger(__name__)

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dine.data.assignment import cheapest_assignment
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
 
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 

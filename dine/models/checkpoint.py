@@ -14,9 +14,9 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dine import __version__
-from dine.data import announced
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.files import atomic_path
+from dine.io import announced
 from dine.models.backbones import BACKBONES, Backbone
 from dine.registry import Registry
 

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from dine.data.surface import Surface
 from dine.errors import DataError
 from dine.files import write_json
-from dine.registration.register import RegistrationResult
-from dine.registration.view import write_view
-from dine.registration.write import (
+from dine.geometry.surface import Surface
+from dine.io.writers import (
     SURFACE_SUFFIXES,
     check_output,
     read_colors,
     write_field,
     write_moved,
 )
+from dine.registration.register import RegistrationResult
+from dine.registration.view import write_view
 
 
 @dataclass(frozen=True)

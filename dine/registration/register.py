@@ -14,12 +14,12 @@ import torch
 from scipy.spatial import cKDTree
 
 from dine import __version__
-from dine.data.readers import read_surface
 from dine.data.sampling import SurfaceSamples, convention_order, sample_surface
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
 from dine.evaluation.quality import distances, fit, folding, landmark_errors
 from dine.files import file_digest
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
 from dine.models.checkpoint import load_backbone
 from dine.models.devices import chosen_device
 from dine.priors import load_prior

@@ -19,10 +19,10 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial import cKDTree
 
-from dine.data.surface import Surface
 from dine.errors import DataError
 from dine.files import write_text
-from dine.registration.write import check_output
+from dine.geometry.surface import Surface
+from dine.io.writers import check_output
 
 #: Suffixes that ``write_view`` writes.
 VIEW_SUFFIXES: tuple[str, ...] = (".html", ".htm")
