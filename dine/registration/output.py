@@ -19,7 +19,7 @@ from dine.io.writers import (
     write_moved,
 )
 from dine.registration.register import RegistrationResult
-from dine.registration.view import write_view
+from dine.viewer.view import View, write_view
 
 
 @dataclass(frozen=True)
@@ -108,17 +108,16 @@ def save(
         suffix = applied[name].suffix if applied else ".ply"
         write_moved(outputs.applied(name, suffix), surface, overwrite=overwrite)
     if view:
-        write_view(
-            outputs.view,
+        shown = View(
             _aligned_source(result),
             result.target,
             result.moved.vertices,
+            f"{Path(result.source.name).name} → {Path(result.target.name).name}",
             scalars=scalars,
             units=dict.fromkeys(scalars, "in units of the files"),
-            title=f"{Path(result.source.name).name} → {Path(result.target.name).name}",
             facts=_facts(result),
-            overwrite=overwrite,
         )
+        write_view(outputs.view, shown, overwrite=overwrite)
     write_json(outputs.report, result.report)
     return said
 
