@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from registrations import deformed_copies, real_pairs
 
+from dine.classical.methods import CLASSICAL
 from dine.data.sampling import sample_surface
 from dine.models.checkpoint import load_backbone
 from dine.registration.calibration import find_field
-from dine.registration.classical import CLASSICAL
 from dine.registration.frame import Frame
 from dine.registration.refine import ROUNDS
 from dine.training.stages import shipped_weights

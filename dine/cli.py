@@ -624,7 +624,7 @@ def classical(pairs, variants, algorithm, arguments, name, out):
 
     Example: dine classical --pairs pairs.h5 --algorithm cpd --out cpd.h5
     """
-    from dine.registration.classical_predictions import classical_predictions as run
+    from dine.classical.predictions import classical_predictions as run
 
     run(
         pairs, list(variants), out, algorithm=algorithm, arguments=arguments, name=name or algorithm

@@ -6,6 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import dine
+from dine.classical.methods import CLASSICAL
 from dine.data.batch import make_batch
 from dine.evaluation.quality import (
     chamfer,
@@ -17,7 +18,6 @@ from dine.evaluation.quality import (
 )
 from dine.geometry.chamfer import chamfer_distance
 from dine.models.backbones import BACKBONES
-from dine.registration.classical import CLASSICAL
 from dine.registration.refine import refine
 from dine.training.stages import new_backbone
 

@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 from samples import POINTS, make_pairs, write_predictions
 
+from dine.classical.predictions import classical_predictions
 from dine.cli import cli
 from dine.config import RefinedMethod
 from dine.data.corruption import make_variant
@@ -17,7 +18,6 @@ from dine.evaluation.conditions import evaluation_conditions
 from dine.evaluation.predictions import Prediction, read_predictions
 from dine.files import read_json
 from dine.priors import PRIORS
-from dine.registration.classical_predictions import classical_predictions
 from dine.registration.predictions import refine_predictions
 from dine.reporting.evidence.examples import typical
 

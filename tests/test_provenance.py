@@ -43,7 +43,7 @@ def test_only_the_classes_that_are_picked_count():
     fit = code_of("fit-prior", "pca_residual")
     assert {"priors.pca_residual", "priors.pca", "priors.fitting", "priors.sources"} <= fit
     assert "priors.flow" not in fit
-    assert "registration.bcpd" in code_of("classical", "bcpd")
+    assert "classical.bcpd" in code_of("classical", "bcpd")
 
 
 def test_what_rivals_run_does_not_depend_on_the_networks():

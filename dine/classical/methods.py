@@ -14,8 +14,8 @@ import numpy as np
 import trimesh.registration
 from threadpoolctl import threadpool_limits
 
+from dine.classical.bcpd import Options, bcpd
 from dine.errors import ConfigError, DataError
-from dine.registration.bcpd import bcpd
 from dine.registration.frame import transformed
 from dine.registration.refine import ROUNDS, refine
 from dine.registry import Registry
@@ -149,7 +149,7 @@ class CPD(Classical):
 
 @CLASSICAL.register("bcpd")
 class BCPD(Classical):
-    """Bayesian coherent point drift (Hirose, IEEE TPAMI 2021): :func:`dine.registration.bcpd.bcpd`.
+    """Bayesian coherent point drift (Hirose, IEEE TPAMI 2021): :func:`dine.classical.bcpd.bcpd`.
 
     Args:
         beta: width of the Gaussian kernel, in standard deviations of the source.
@@ -184,7 +184,7 @@ class BCPD(Classical):
         self.tolerance = _positive("tolerance", tolerance)
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return bcpd(source, target, **vars(self)).moved
+        return bcpd(source, target, Options(**vars(self))).moved
 
 
 @CLASSICAL.register("smooth")
