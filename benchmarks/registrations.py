@@ -32,9 +32,9 @@ import torch
 
 from dine.data.deformation import rbf_displacement
 from dine.data.pairs import read_pairs
+from dine.geometry.rigid import transformed
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
-from dine.registration.frame import transformed
 from dine.registration.register import Model, load_model, register
 
 RECIPE = {"control_percent": 5, "width": 0.4, "amplitude": 0.15, "points": 1024}

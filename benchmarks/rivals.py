@@ -19,9 +19,9 @@ from registrations import deformed_copies, real_pairs
 
 from dine.classical.methods import CLASSICAL
 from dine.data.sampling import sample_surface
+from dine.geometry.frame import Frame
 from dine.models.checkpoint import load_backbone
 from dine.registration.calibration import find_field
-from dine.registration.frame import Frame
 from dine.registration.refine import ROUNDS
 from dine.training.stages import shipped_weights
 
@@ -59,10 +59,10 @@ def main() -> None:
                 continue
             rng = np.random.default_rng(0)
             samples = sample_surface(source, POINTS, rng)
-            frame = Frame.of(samples.carry(source.vertices))
-            start = frame.normalise(samples.carry(source.vertices))
-            goal = frame.normalise(sample_surface(target, POINTS, rng).carry(target.vertices))
-            places = frame.normalise(samples.carry(truth))
+            frame = Frame.of(samples.places(source.vertices))
+            start = frame.normalise(samples.places(source.vertices))
+            goal = frame.normalise(sample_surface(target, POINTS, rng).places(target.vertices))
+            places = frame.normalise(samples.places(truth))
             errors = [
                 100 * np.linalg.norm(start + method(start, goal) - places, axis=1).mean()
                 for method in tried.values()

@@ -835,7 +835,7 @@ def _alignment(prealign: str):
         return prealign
     import numpy as np
 
-    from dine.registration.frame import check_rigid
+    from dine.geometry.rigid import check_rigid
 
     try:
         return check_rigid(np.loadtxt(prealign), prealign)

@@ -127,7 +127,7 @@ def test_points_map_back_onto_the_meshes(pairs, inventory):
     for i in (0, 4, 9):
         for role in ("source", "target"):
             mesh = read_surface(inventory.folder / getattr(pairs, f"{role}_file")[i])
-            expected = pairs.samples(i).carry(mesh.vertices)
+            expected = pairs.samples(i).places(mesh.vertices)
             found = pairs.to_original(getattr(pairs, role)[i], i)
             np.testing.assert_allclose(found, expected, atol=1e-6)
 

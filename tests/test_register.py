@@ -13,7 +13,10 @@ import dine
 from dine.cli import cli
 from dine.data.pairs import PAIR_DATASETS, PairSet, Variant, read_pairs, write_pairs, write_variant
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
-from dine.evaluation.quality import fit, folding, landmark_errors
+from dine.geometry.distance import landmark_errors, surface_distance
+from dine.geometry.folding import folding
+from dine.geometry.frame import Frame
+from dine.geometry.rigid import check_rigid, rigid_alignment, transformed
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_surface
@@ -21,7 +24,6 @@ from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior
 from dine.registration.calibration import Calibration, load_calibration, plausibility
-from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
 from dine.registration.refine import ROUNDS
 from dine.registration.register import load_model
 from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
@@ -104,13 +106,13 @@ def test_fit_is_what_its_names_say():
     a, b = rng.normal(size=(2, 40, 3))
     table = np.linalg.norm(a[:, None] - b[None], axis=2)
     there, back = table.min(axis=1), table.min(axis=0)
-    found = fit(a, b)
+    found = surface_distance(a, b)
     assert found["chamfer"] == pytest.approx((there**2).mean() + (back**2).mean())
     assert found["chamfer_unsquared"] == pytest.approx(there.mean() + back.mean())
     assert found["hausdorff"] == pytest.approx(max(there.max(), back.max()))
     expected = max(np.percentile(there, 95), np.percentile(back, 95))
     assert found["hd95"] == pytest.approx(expected)
-    assert fit(a, b, partial=True)["chamfer"] == pytest.approx((back**2).mean())
+    assert surface_distance(a, b, partial=True)["chamfer"] == pytest.approx((back**2).mean())
 
 
 def test_folding_is_the_share_turned_inside_out():

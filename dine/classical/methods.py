@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from dine.classical.bcpd import Options, bcpd
 from dine.errors import ConfigError, DataError
-from dine.registration.frame import transformed
+from dine.geometry.rigid import transformed
 from dine.registration.refine import ROUNDS, refine
 from dine.registry import Registry
 
@@ -69,7 +69,7 @@ class Unregistered(Classical):
 class RigidICP(Classical):
     """Rotation and translation by iterative closest points (trimesh), from where the clouds are.
 
-    Unlike :func:`dine.registration.frame.rigid_alignment`, whatever it ends at is taken.
+    Unlike :func:`dine.geometry.rigid.rigid_alignment`, whatever it ends at is taken.
 
     Args:
         iterations: at most.

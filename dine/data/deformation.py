@@ -84,7 +84,7 @@ def rbf_displacement(
         points=points,
     )
     count = max(1, round(control_percent / 100 * points))
-    controls = sample_surface(surface, count, rng).carry(surface.vertices)
+    controls = sample_surface(surface, count, rng).places(surface.vertices)
     centre, radius = _frame(surface)
     controls = (controls - centre) / radius
     moves = rng.standard_normal((count, 3)) * (amplitude * level)

@@ -13,8 +13,9 @@ import torch
 from dine.data.batch import make_batch
 from dine.data.pairs import PairSet, read_seen
 from dine.errors import DataError
-from dine.evaluation.quality import fit, folding
 from dine.files import file_digest, read_json, write_json
+from dine.geometry.distance import surface_distance
+from dine.geometry.folding import folding
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.models.checkpoint import load_backbone
 from dine.priors import PCAPrior, Prior, load_prior
@@ -175,8 +176,8 @@ def _measure(
             spreads.append(spread)
             errors.append(np.linalg.norm(moved - target, axis=1))
             values = {
-                "initial": fit(source, goal)["chamfer"],
-                "final": fit(moved, goal)["chamfer"],
+                "initial": surface_distance(source, goal)["chamfer"],
+                "final": surface_distance(moved, goal)["chamfer"],
                 "reach": float(np.linalg.norm(found, axis=1).max()),
                 "folding": folding(source, found),
                 **((plausibility(prior, found, source) if prior else None) or {}),

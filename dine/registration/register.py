@@ -16,8 +16,12 @@ from scipy.spatial import cKDTree
 from dine import __version__
 from dine.data.sampling import SurfaceSamples, convention_order, sample_surface
 from dine.errors import ConfigError, DataError
-from dine.evaluation.quality import distances, fit, folding, landmark_errors
 from dine.files import file_digest
+from dine.geometry.distance import distances, landmark_errors, surface_distance
+from dine.geometry.folding import folding
+from dine.geometry.frame import Frame
+from dine.geometry.interpolation import FittedDisplacement, FittedValues
+from dine.geometry.rigid import check_rigid, rigid_alignment, transformed
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.models.checkpoint import load_backbone
@@ -29,8 +33,6 @@ from dine.registration.calibration import (
     load_calibration,
     plausibility,
 )
-from dine.registration.carry import carry
-from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
 from dine.registration.refine import ROUNDS, refine
 from dine.registration.trust import Trust, assess
 from dine.training.stages import WEIGHTS, shipped_weights
@@ -195,7 +197,8 @@ def register(
     """Register a source to a target, of any number of points and in any (the same) units.
 
     The network sees ``points`` points of each, drawn by area from a mesh and without replacement
-    from a cloud. Its field is carried to all source vertices by :func:`~dine.registration.carry`.
+    from a cloud. Its field is interpolated to all source vertices
+    (:mod:`dine.geometry.interpolation`).
 
     Args:
         source: what moves.
@@ -222,8 +225,8 @@ def register(
     notes = _check_sizes(source, target, partial)
     rng = np.random.default_rng([4, seed])
     samples = _draw(source, points, rng, "source")
-    seen = _draw(target, points, rng, "target").carry(target.vertices)
-    places = samples.carry(source.vertices)
+    seen = _draw(target, points, rng, "target").places(target.vertices)
+    places = samples.places(source.vertices)
     matrix = _aligned(prealign, places, seen, partial)
     frame = Frame.of(transformed(places, matrix))
     start = frame.normalise(transformed(places, matrix))
@@ -293,9 +296,11 @@ def _result(
     notes: tuple[str, ...],
     settings: dict[str, Any],
 ) -> RegistrationResult:
+    fitted = FittedDisplacement(start, found)
+
     def move(vertices: np.ndarray) -> np.ndarray:
         aligned = frame.normalise(transformed(vertices, matrix))
-        return frame.restore(aligned + carry(start, found, aligned))
+        return frame.restore(aligned + fitted(aligned))
 
     def moved_surface(surface: Surface) -> Surface:
         return Surface(move(surface.vertices), surface.faces, name=surface.name)
@@ -310,12 +315,12 @@ def _result(
     if calibration is not None and spread is not None:
         error = calibration.expected_error(spread)
         aligned = frame.normalise(transformed(source.vertices, matrix))
-        uncertainty = carry(start, error[:, None], aligned)[:, 0] * frame.scale
+        uncertainty = FittedValues(start, error[:, None])(aligned)[:, 0] * frame.scale
         at_points = error * frame.scale
         expected = float(at_points.mean())
     values = {
-        "initial": fit(start, goal, partial=partial)["chamfer"],
-        "final": fit(start + found, goal, partial=partial)["chamfer"],
+        "initial": surface_distance(start, goal, partial=partial)["chamfer"],
+        "final": surface_distance(start + found, goal, partial=partial)["chamfer"],
         "reach": float(np.linalg.norm(found, axis=1).max()),
         "folding": folding(start, found),
     }
@@ -323,8 +328,8 @@ def _result(
         values |= plausibility(model.prior, found, start) or {}
     dense_target = _dense(target)
     dense_source = _dense(source)
-    aligned = fit(transformed(dense_source, matrix), dense_target, partial=partial)
-    after = fit(move(dense_source), dense_target, partial=partial)
+    aligned = surface_distance(transformed(dense_source, matrix), dense_target, partial=partial)
+    after = surface_distance(move(dense_source), dense_target, partial=partial)
     checks = {"remaining": _ratio(after["chamfer"], aligned["chamfer"])}
     if inconsistency is not None:
         checks["inconsistency"] = inconsistency
@@ -336,7 +341,7 @@ def _result(
         "dine": __version__,
         "source": {"name": source.name, "vertices": len(source.vertices)},
         "target": {"name": target.name, "vertices": len(target.vertices)},
-        "before": fit(dense_source, dense_target, partial=partial),
+        "before": surface_distance(dense_source, dense_target, partial=partial),
         "aligned": aligned,
         "after": after,
         "normalised": values,
@@ -425,7 +430,7 @@ def _dense(surface: Surface) -> np.ndarray:
     if surface.faces is None:
         return surface.vertices
     rng = np.random.default_rng(5)
-    return sample_surface(surface, 4 * POINTS, rng).carry(surface.vertices)
+    return sample_surface(surface, 4 * POINTS, rng).places(surface.vertices)
 
 
 def _check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
@@ -475,8 +480,8 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> tuple[np.nda
     """Displacement (N, 3) and support (N,) of source points whose target is a part of them.
 
     The part is registered to the whole, in which each of its points has a counterpart; the inverse
-    is known where they end up and carried from there. Networks mistake parts for wholes, so they
-    have no say.
+    is known where they end up and interpolated from there. Networks mistake parts for wholes, so
+    they have no say.
 
     Raises:
         DataError: the part ends up beside the source.
@@ -492,7 +497,7 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> tuple[np.nda
             "Hardly any part of the source is found in the target; check that both show the same "
             "object, or leave out `partial`."
         )
-    return carry(places, -back, start), supported
+    return FittedDisplacement(places, -back)(start), supported
 
 
 def _inconsistency(
@@ -512,7 +517,7 @@ def _inconsistency(
     seen, whole = frame.normalise(goal), frame.normalise(start)
     back = find_field(model.backbone, seen, whole, where, rounds)[0] * frame.scale
     places = start + found
-    return float(np.linalg.norm(found + carry(goal, back, places), axis=1).mean())
+    return float(np.linalg.norm(found + FittedDisplacement(goal, back)(places), axis=1).mean())
 
 
 def _ratio(value: float, of: float) -> float:
