@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from dine.models.checkpoint import load_backbone
+from dine.refinement.refine import ROUNDS, refine
 from dine.registration.calibration import find_field
-from dine.registration.refine import ROUNDS, refine
 from dine.training.stages import shipped_weights
 
 
@@ -42,7 +42,7 @@ def main() -> None:
             for rounds, what in ((0, "network alone"), (ROUNDS, "refined")):
                 field, _ = find_field(backbone, source, target, torch.device("cpu"), rounds)
                 record(f"our {kind}, {what}", field)
-        record("refinement without a network", refine(source, target, None, None))
+        record("refinement without a network", refine(source, target).mean)
     print("| |", " | ".join(names), "|")
     print("|---" * (len(names) + 1) + "|")
     for method, errors in rows.items():

@@ -21,8 +21,8 @@ from dine.classical.methods import CLASSICAL
 from dine.data.sampling import sample_surface
 from dine.geometry.frame import Frame
 from dine.models.checkpoint import load_backbone
+from dine.refinement.refine import ROUNDS
 from dine.registration.calibration import find_field
-from dine.registration.refine import ROUNDS
 from dine.training.stages import shipped_weights
 
 POINTS = 1024

@@ -591,7 +591,7 @@ def refine_predictions(predictions, pairs, variants, settings, prior, name, out)
 
     Example: dine refine-predictions --predictions predictions.h5 --pairs pairs.h5 --out refined.h5
     """
-    from dine.registration.predictions import refine_predictions as run
+    from dine.evaluation.refined import refine_predictions as run
 
     _start_torch()
     run(

@@ -23,8 +23,8 @@ from dine.io.writers import write_surface
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior
+from dine.refinement.refine import ROUNDS
 from dine.registration.calibration import Calibration, load_calibration, plausibility
-from dine.registration.refine import ROUNDS
 from dine.registration.register import load_model
 from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 

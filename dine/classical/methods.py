@@ -14,10 +14,10 @@ import numpy as np
 import trimesh.registration
 from threadpoolctl import threadpool_limits
 
-from dine.classical.bcpd import Options, bcpd
+from dine.classical import bcpd
 from dine.errors import ConfigError, DataError
 from dine.geometry.rigid import transformed
-from dine.registration.refine import ROUNDS, refine
+from dine.refinement.refine import ROUNDS, Options, refine
 from dine.registry import Registry
 
 # Defaults of "cpd" and "bcpd": of 53 and 21 settings, those with the lowest mean correspondence
@@ -184,12 +184,12 @@ class BCPD(Classical):
         self.tolerance = _positive("tolerance", tolerance)
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return bcpd(source, target, Options(**vars(self))).moved
+        return bcpd.bcpd(source, target, bcpd.Options(**vars(self))).moved
 
 
 @CLASSICAL.register("smooth")
 class SmoothFields(Classical):
-    """The most probable smooth field: :func:`dine.registration.refine.refine` without a network.
+    """The most probable smooth field: :func:`dine.refinement.refine.refine` without a network.
 
     What refinement at test time achieves on its own; our method, not one from the literature.
 
@@ -201,7 +201,7 @@ class SmoothFields(Classical):
         self.rounds = int(_positive("rounds", rounds))
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return source + refine(source, target, None, None, rounds=self.rounds)
+        return source + refine(source, target, options=Options(self.rounds)).mean
 
 
 def _points(points: np.ndarray, what: str) -> np.ndarray:

@@ -20,7 +20,7 @@ from dine.models.backbones import Backbone, marginal_deviation
 from dine.models.checkpoint import load_backbone
 from dine.priors import PCAPrior, Prior, load_prior
 from dine.progress import Progress
-from dine.registration.refine import ROUNDS, expected_error, refine
+from dine.refinement.refine import ROUNDS, Observed, Options, refine
 
 CALIBRATION_FORMAT = "dine-calibration"
 _BINS = 20
@@ -136,7 +136,7 @@ def find_field(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Displacement (N, 3) and what tells its errors apart (N,), float64, normalised frame.
 
-    The network's field, refined in some rounds (see :func:`~dine.registration.refine.refine`); 0
+    The network's field, refined in some rounds (see :func:`~dine.refinement.refine.refine`); 0
     leaves it as it is. Errors of the network's own field grow with the standard deviation of its
     marginals (None from a backbone without). What is left after refinement has little to do with
     that, but grows with how far a point moved, and with how far the network would have moved it
@@ -149,7 +149,8 @@ def find_field(
     spread = None if deviation is None else deviation[0].double().cpu().numpy()
     if rounds == 0:
         return found, spread
-    refined = refine(source, target, found, expected_error(spread, len(found)), rounds=rounds)
+    observed = Observed.of_network(found, spread)
+    refined = refine(source, target, observed, options=Options(rounds)).mean
     elsewhere = np.linalg.norm(refined - found, axis=1)
     return refined, np.linalg.norm(refined, axis=1) + elsewhere
 

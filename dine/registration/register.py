@@ -27,13 +27,13 @@ from dine.io.readers import read_surface
 from dine.models.checkpoint import load_backbone
 from dine.models.devices import chosen_device
 from dine.priors import load_prior
+from dine.refinement.refine import ROUNDS, Options, refine
 from dine.registration.calibration import (
     Calibration,
     find_field,
     load_calibration,
     plausibility,
 )
-from dine.registration.refine import ROUNDS, refine
 from dine.registration.trust import Trust, assess
 from dine.training.stages import WEIGHTS, shipped_weights
 
@@ -488,7 +488,7 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> tuple[np.nda
     """
     frame = Frame.of(goal)
     part, whole = frame.normalise(goal), frame.normalise(start)
-    back = refine(part, whole, None, None, rounds=rounds, part=True) * frame.scale
+    back = refine(part, whole, options=Options(rounds, part=True)).mean * frame.scale
     places = goal + back
     reach = _RETURN * float(np.median(cKDTree(start).query(start, k=2)[0][:, 1]))
     supported = distances(start, places) < reach
