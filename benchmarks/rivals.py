@@ -20,10 +20,9 @@ from registrations import deformed_copies, real_pairs
 from dine.classical.methods import CLASSICAL
 from dine.data.sampling import sample_surface
 from dine.geometry.frame import Frame
-from dine.models.checkpoint import load_backbone
+from dine.models.checkpoint import load_backbone, shipped_weights
 from dine.refinement.refine import ROUNDS
-from dine.registration.calibration import find_field
-from dine.training.stages import shipped_weights
+from dine.registration.correspondence import predict_and_refine
 
 POINTS = 1024
 
@@ -35,7 +34,7 @@ def methods() -> dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
     for kind in ("robust_defreg", "deftransnet"):
         backbone, _ = load_backbone(shipped_weights(kind))
         for rounds, what in ((0, "network"), (ROUNDS, "refined")):
-            found[f"{kind}, {what}"] = lambda s, t, b=backbone, r=rounds: find_field(
+            found[f"{kind}, {what}"] = lambda s, t, b=backbone, r=rounds: predict_and_refine(
                 b, s, t, cpu, r
             )[0]
     return found

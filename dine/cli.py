@@ -781,7 +781,7 @@ def model_options(command):
 
     @functools.wraps(command)
     def run(backbone, weights, prior, calibration, device, precision, **values):
-        from dine.registration.register import load_model
+        from dine.registration.model import load_model
 
         def load():
             model = load_model(backbone, weights=weights, prior=prior, calibration=calibration)
@@ -889,7 +889,7 @@ def register(
     from dine.io.readers import read_surface
     from dine.registration.output import Outputs, save
     from dine.registration.register import register as run
-    from dine.registration.register import shapes_by_name
+    from dine.registration.shapes import shapes_by_name
 
     _start_torch()
     shapes = shapes_by_name(apply)
@@ -983,7 +983,7 @@ def calibrate(model, pairs, targets, prior, device, out):
     --prior pca.safetensors --out calibration.json
     """
     from dine.models.devices import chosen_device, leased
-    from dine.registration.calibration import calibrate as run
+    from dine.registration.calibrate import calibrate as run
 
     _start_torch()
     with leased(chosen_device(device)) as [found]:

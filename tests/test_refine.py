@@ -6,14 +6,13 @@ import torch
 import trimesh
 from scipy.spatial.distance import cdist
 
-from dine.models.checkpoint import load_backbone
+from dine.models.checkpoint import load_backbone, shipped_weights
 from dine.priors.gaussian import LinearGaussian, squared_exponential
 from dine.refinement.em import Matches, Mixture
 from dine.refinement.process import LOOSE, STIFF
 from dine.refinement.refine import Observed, Options, refine
 from dine.refinement.shared_points import SharedPoints
-from dine.registration.calibration import find_field
-from dine.training.stages import shipped_weights
+from dine.registration.correspondence import predict_and_refine
 
 pytestmark = pytest.mark.numerical
 
@@ -291,5 +290,5 @@ def test_the_authors_checkpoint_is_beaten_on_its_own_demo_pairs(shared, kind):
     for name in {key.split("/")[0] for key in stored}:
         source, target = (stored[f"{name}/{x}"].astype(float) for x in ("source", "target"))
         truth = target[stored[f"{name}/target_index_of_source"]] - source
-        found, _ = find_field(backbone, source, target, torch.device("cpu"))
+        found, _ = predict_and_refine(backbone, source, target, torch.device("cpu"))
         assert error(found, truth) < 0.5 * error(stored[f"{name}/displacement"], truth)

@@ -24,9 +24,9 @@ from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior
 from dine.refinement.refine import ROUNDS
+from dine.registration.assessment import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 from dine.registration.calibration import Calibration, load_calibration, plausibility
-from dine.registration.register import load_model
-from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
+from dine.registration.model import load_model
 
 pytestmark = pytest.mark.numerical
 POINTS = 1024

@@ -29,6 +29,9 @@ _FACTORIES = ("empty", "zeros", "ones", "full", "eye", "arange", "rand", "randn"
 
 BACKBONE_FORMAT = "dine-backbone"
 
+WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
+"""Folder of what comes with the package: weights, and their priors and calibrations."""
+
 
 def save_tensors(path: str | Path, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
     """Write tensors and JSON facts atomically; equal input gives equal bytes."""
@@ -93,6 +96,21 @@ def load_backbone(path: str | Path) -> tuple[Backbone, dict[str, Any]]:
         state, facts = load_tensors(path, BACKBONE_FORMAT)
     backbone = rebuilt(BACKBONES, Backbone, facts, ("backbone", "arguments"), state, path)
     return backbone, facts
+
+
+def shipped_weights(kind: str) -> Path:
+    """The pretrained weights that come with the package.
+
+    Raises:
+        ConfigError: there are none for this backbone.
+    """
+    path = WEIGHTS / f"{kind}.safetensors"
+    if not path.is_file():
+        raise ConfigError(
+            f"There are no pretrained weights for the backbone {kind!r}; set `stage1.start` to "
+            "random or to a file of weights."
+        )
+    return path
 
 
 class _Budget(TorchDispatchMode):

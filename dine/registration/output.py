@@ -18,7 +18,7 @@ from dine.io.writers import (
     write_field,
     write_moved,
 )
-from dine.registration.register import RegistrationResult
+from dine.registration.types import RegistrationResult
 from dine.viewer.view import View, write_view
 
 
@@ -124,8 +124,7 @@ def save(
 
 def _aligned_source(result: RegistrationResult) -> Surface:
     """The source as the network got it: what is shown to deform should not also fly in."""
-    matrix = np.array(result.report["alignment"])
-    vertices = result.source.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = result.alignment.align(result.source.vertices)
     return Surface(vertices, result.source.faces, name=result.source.name)
 
 
