@@ -16,7 +16,7 @@ from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.geometry.distance import landmark_errors, surface_distance
 from dine.geometry.folding import folding
 from dine.geometry.frame import Frame
-from dine.geometry.rigid import check_rigid, rigid_alignment, transformed
+from dine.geometry.rigid import Alignment, check_rigid, rigid_alignment, transformed
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_surface
@@ -101,7 +101,17 @@ def test_frame_goes_there_and_back():
     assert np.allclose(frame.restore(inside), points)
 
 
-def test_fit_is_what_its_names_say():
+def test_an_alignment_goes_there_and_back():
+    points = 100 * np.random.default_rng(1).normal(size=(50, 3)) + 7
+    alignment = Alignment.of(points, turned())
+    assert np.allclose(alignment.align(points), transformed(points, turned()))
+    assert np.allclose(alignment.unalign(alignment.align(points)), points)
+    inside = alignment.normalise(points)
+    assert np.linalg.norm(inside, axis=1).max() == pytest.approx(1)
+    assert np.allclose(alignment.restore(inside), alignment.align(points))
+
+
+def test_surface_distance_is_what_its_names_say():
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(2, 40, 3))
     table = np.linalg.norm(a[:, None] - b[None], axis=2)
@@ -219,6 +229,8 @@ def test_registration_brings_the_source_to_its_target(pair, result):
     assert (result.moved.faces == source.faces).all()
     assert np.allclose(result.moved.vertices, source.vertices + result.displacement)
     assert result.supported.all()
+    assert result.alignment.matrix.tolist() == result.report["alignment"]
+    assert result.alignment.frame.scale == result.report["normalisation"]["scale"]
     json.dumps(result.report, allow_nan=False)
 
 

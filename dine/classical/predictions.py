@@ -40,8 +40,8 @@ def classical_predictions(
         ) from None
 
     def fields(condition: Condition) -> Prediction:
-        found, seconds = each_pair(condition, name, lambda _, *clouds: method(*clouds))
-        return prediction(condition, found, seconds)
+        moved, seconds = each_pair(condition, name, lambda _, *clouds: method(*clouds))
+        return prediction(condition, moved, seconds)
 
     facts = {"pairs": file_digest(pairs_path), "name": name}
     write_predictions(out, evaluation_conditions(pairs_path, variants), fields, **facts)

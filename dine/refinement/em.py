@@ -193,15 +193,15 @@ class Mixture:
             drawn = weight @ self._target
             mass = drawn[:, 3].astype(np.float64)
             pulled = drawn[:, :3] - mass[:, None] * source[self._free]
-            found, energy = self._solve(pulled, mass, variance)
-            step = found - last
-            if momentum and ((found - field) * step).sum() < 0:
+            solved, energy = self._solve(pulled, mass, variance)
+            step = solved - last
+            if momentum and ((solved - field) * step).sum() < 0:
                 momentum = 0
             momentum += 1
             # The last field is one that maximises, not one beyond.
             settled = float((step**2).sum(axis=1).mean()) < _SETTLED**2
             beyond = 0.0 if settled or number == rounds - 1 else momentum / (momentum + 3)
-            last, field = found, found + beyond * step
+            last, field = solved, solved + beyond * step
             squared = self._squared(source + field)
             distance = float(np.vdot(weight, squared))
             variance = max(distance / (3 * max(mass.sum(), 1e-9)), least)

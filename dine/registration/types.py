@@ -121,8 +121,8 @@ class Motion:
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """(V, 3) points, moved."""
-        aligned = self.alignment.normalise(points)
-        return self.alignment.restore(aligned + self.field(aligned))
+        places = self.alignment.normalise(points)
+        return self.alignment.restore(places + self.field(places))
 
     def surface(self, surface: Surface) -> Surface:
         """A surface with its vertices moved."""

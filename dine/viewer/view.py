@@ -147,9 +147,9 @@ def _light(surface: Surface) -> tuple[Surface, np.ndarray]:
     if count <= _MOST:
         return surface, np.arange(count)
     if surface.faces is not None:
-        found = _simplified(surface)
-        if found is not None:
-            return found
+        simplified = _simplified(surface)
+        if simplified is not None:
+            return simplified
     rows = np.sort(np.random.default_rng(0).permutation(count)[:_MOST])
     return Surface(surface.vertices[rows], name=surface.name), rows
 
