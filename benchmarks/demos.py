@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dine.models.checkpoint import load_backbone
-from dine.registration.calibration import find_field
-from dine.registration.refine import ROUNDS, refine
-from dine.training.stages import shipped_weights
+from dine.models.checkpoint import load_backbone, shipped_weights
+from dine.refinement.refine import ROUNDS, refine
+from dine.registration.correspondence import predict_and_refine
 
 
 def main() -> None:
@@ -40,9 +39,9 @@ def main() -> None:
         for kind in ("robust_defreg", "deftransnet"):
             backbone, _ = load_backbone(shipped_weights(kind))
             for rounds, what in ((0, "network alone"), (ROUNDS, "refined")):
-                field, _ = find_field(backbone, source, target, torch.device("cpu"), rounds)
+                field, _ = predict_and_refine(backbone, source, target, torch.device("cpu"), rounds)
                 record(f"our {kind}, {what}", field)
-        record("refinement without a network", refine(source, target, None, None))
+        record("refinement without a network", refine(source, target).mean)
     print("| |", " | ".join(names), "|")
     print("|---" * (len(names) + 1) + "|")
     for method, errors in rows.items():

@@ -32,10 +32,11 @@ import torch
 
 from dine.data.deformation import rbf_displacement
 from dine.data.pairs import read_pairs
-from dine.data.readers import read_surface
-from dine.data.surface import Surface
-from dine.registration.frame import transformed
-from dine.registration.register import Model, load_model, register
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.registration.model import load_model
+from dine.registration.register import register
+from dine.registration.types import Model
 
 RECIPE = {"control_percent": 5, "width": 0.4, "amplitude": 0.15, "points": 1024}
 LEVEL = 0.4
@@ -97,10 +98,9 @@ def count_verdicts(objects: Path, cases: list[str], model: Model) -> None:
             result = register(source, target, model=model)
             good = False
             if truth is not None:
-                aligned = transformed(source.vertices, np.array(result.report["alignment"]))
+                aligned = result.alignment.align(source.vertices)
                 errors = [
-                    np.linalg.norm(places - truth, axis=1).mean()
-                    / result.report["normalisation"]["scale"]
+                    np.linalg.norm(places - truth, axis=1).mean() / result.alignment.frame.scale
                     for places in (aligned, result.moved.vertices)
                 ]
                 good = bool(errors[1] <= min(0.95 * errors[0], 0.15))
@@ -184,7 +184,7 @@ def main() -> None:
             report = result.report
             unit = report["normalisation"]["scale"] / 100
             places = [source.vertices]
-            places += [transformed(source.vertices, np.array(report["alignment"]))]
+            places += [result.alignment.align(source.vertices)]
             places += [result.moved.vertices]
             if shipped:
                 places += [register(source, target, model=shipped, **settings).moved.vertices]

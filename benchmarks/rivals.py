@@ -17,13 +17,12 @@ import numpy as np
 import torch
 from registrations import deformed_copies, real_pairs
 
+from dine.classical.methods import CLASSICAL
 from dine.data.sampling import sample_surface
-from dine.models.checkpoint import load_backbone
-from dine.registration.calibration import find_field
-from dine.registration.classical import CLASSICAL
-from dine.registration.frame import Frame
-from dine.registration.refine import ROUNDS
-from dine.training.stages import shipped_weights
+from dine.geometry.frame import Frame
+from dine.models.checkpoint import load_backbone, shipped_weights
+from dine.refinement.refine import ROUNDS
+from dine.registration.correspondence import predict_and_refine
 
 POINTS = 1024
 
@@ -35,7 +34,7 @@ def methods() -> dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
     for kind in ("robust_defreg", "deftransnet"):
         backbone, _ = load_backbone(shipped_weights(kind))
         for rounds, what in ((0, "network"), (ROUNDS, "refined")):
-            found[f"{kind}, {what}"] = lambda s, t, b=backbone, r=rounds: find_field(
+            found[f"{kind}, {what}"] = lambda s, t, b=backbone, r=rounds: predict_and_refine(
                 b, s, t, cpu, r
             )[0]
     return found
@@ -59,10 +58,10 @@ def main() -> None:
                 continue
             rng = np.random.default_rng(0)
             samples = sample_surface(source, POINTS, rng)
-            frame = Frame.of(samples.carry(source.vertices))
-            start = frame.normalise(samples.carry(source.vertices))
-            goal = frame.normalise(sample_surface(target, POINTS, rng).carry(target.vertices))
-            places = frame.normalise(samples.carry(truth))
+            frame = Frame.of(samples.places(source.vertices))
+            start = frame.normalise(samples.places(source.vertices))
+            goal = frame.normalise(sample_surface(target, POINTS, rng).places(target.vertices))
+            places = frame.normalise(samples.places(truth))
             errors = [
                 100 * np.linalg.norm(start + method(start, goal) - places, axis=1).mean()
                 for method in tried.values()

@@ -322,8 +322,7 @@ def memory_and_growth(threads: int) -> list[dict]:
 
 def precision() -> list[dict]:
     """What bf16 does to the displacement of trained weights."""
-    from dine.models.checkpoint import load_backbone
-    from dine.training.stages import shipped_weights
+    from dine.models.checkpoint import load_backbone, shipped_weights
 
     rows = []
     for name in NAMES:

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from dine.registration.register import RegistrationResult, load_model, register
+    from dine.registration.model import load_model
+    from dine.registration.register import register
+    from dine.registration.types import RegistrationResult
 
 __all__ = ["RegistrationResult", "__version__", "load_model", "register"]
 

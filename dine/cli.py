@@ -591,7 +591,7 @@ def refine_predictions(predictions, pairs, variants, settings, prior, name, out)
 
     Example: dine refine-predictions --predictions predictions.h5 --pairs pairs.h5 --out refined.h5
     """
-    from dine.registration.predictions import refine_predictions as run
+    from dine.evaluation.refined import refine_predictions as run
 
     _start_torch()
     run(
@@ -624,7 +624,7 @@ def classical(pairs, variants, algorithm, arguments, name, out):
 
     Example: dine classical --pairs pairs.h5 --algorithm cpd --out cpd.h5
     """
-    from dine.registration.classical_predictions import classical_predictions as run
+    from dine.classical.predictions import classical_predictions as run
 
     run(
         pairs, list(variants), out, algorithm=algorithm, arguments=arguments, name=name or algorithm
@@ -781,7 +781,7 @@ def model_options(command):
 
     @functools.wraps(command)
     def run(backbone, weights, prior, calibration, device, precision, **values):
-        from dine.registration.register import load_model
+        from dine.registration.model import load_model
 
         def load():
             model = load_model(backbone, weights=weights, prior=prior, calibration=calibration)
@@ -835,7 +835,7 @@ def _alignment(prealign: str):
         return prealign
     import numpy as np
 
-    from dine.registration.frame import check_rigid
+    from dine.geometry.rigid import check_rigid
 
     try:
         return check_rigid(np.loadtxt(prealign), prealign)
@@ -886,10 +886,10 @@ def register(
     Beside the moved source OUT go the displacement of every vertex (OUT.field.npz, OUT.field.vtp),
     a report (OUT.json) and, with --view, a page to look at (OUT.html).
     """
-    from dine.data.readers import read_surface
+    from dine.io.readers import read_surface
     from dine.registration.output import Outputs, save
     from dine.registration.register import register as run
-    from dine.registration.register import shapes_by_name
+    from dine.registration.shapes import shapes_by_name
 
     _start_torch()
     shapes = shapes_by_name(apply)
@@ -983,7 +983,7 @@ def calibrate(model, pairs, targets, prior, device, out):
     --prior pca.safetensors --out calibration.json
     """
     from dine.models.devices import chosen_device, leased
-    from dine.registration.calibration import calibrate as run
+    from dine.registration.calibrate import calibrate as run
 
     _start_torch()
     with leased(chosen_device(device)) as [found]:

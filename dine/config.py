@@ -429,7 +429,7 @@ class RefinedMethod(NetworkMethod):
     kind: Literal["refined"]
     group: Literal["test time"] = "test time"
     algorithm: Literal["closed_form", "gradient"] = "closed_form"
-    """Expectation–maximisation under a Gaussian prior, or descent on any data term and prior."""
+    """Expectation–maximisation under a Gaussian prior, or by gradient: any data term and prior."""
     of: str = STAGE1
     """The trained network whose field is refined."""
     weight: NonNegative = 0.0

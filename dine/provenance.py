@@ -228,7 +228,8 @@ def _defining(module: str, name: str) -> str:
         return f"{module}.{name}"
     file = _source(module)
     if file is not None and file.name == "__init__.py":
-        for node in _parsed(file).body:
+        # Also under TYPE_CHECKING, where stands what is passed on when it is asked for.
+        for node in ast.walk(_parsed(file)):
             if isinstance(node, ast.ImportFrom):
                 for alias in node.names:
                     if (alias.asname or alias.name) == name:

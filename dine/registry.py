@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 from dine.errors import ConfigError
@@ -15,8 +15,10 @@ T = TypeVar("T")
 class Registry(Generic[T]):
     """Maps names such as ``"pca"`` or ``"my_package.priors:MyPrior"`` to classes."""
 
-    def __init__(self, what: str):
+    def __init__(self, what: str, modules: Mapping[str, str] | None = None):
+        """``modules`` of built-in names are imported where these are asked for, and not before."""
         self.what = what
+        self._modules = dict(modules or {})
         self._classes: dict[str, type[T]] = {}
 
     def register(self, name: str) -> Callable[[type[T]], type[T]]:
@@ -31,7 +33,7 @@ class Registry(Generic[T]):
 
     def names(self) -> list[str]:
         """The built-in names, sorted."""
-        return sorted(self._classes)
+        return sorted({*self._classes, *self._modules})
 
     def named_in_file(self, name: Any, base: type[T]) -> type[T]:
         """The class that a file says it was made with: a built-in one, or an extension's.
@@ -44,9 +46,8 @@ class Registry(Generic[T]):
         """
         if not isinstance(name, str):
             raise ConfigError(f"The name of the {self.what} is {name!r}; expected text.")
-        if name not in self._classes and name.split(".")[0].split(":")[0] in (
-            sys.stdlib_module_names
-        ):
+        package = name.split(".")[0].split(":")[0]
+        if name not in self.names() and package in sys.stdlib_module_names:
             raise ConfigError(f"{name!r} is no {self.what}.")
         cls = self.get(name)
         if not (isinstance(cls, type) and issubclass(cls, base)):
@@ -59,6 +60,8 @@ class Registry(Generic[T]):
         Raises:
             ConfigError: neither a registered name nor an importable ``module:Class``.
         """
+        if name not in self._classes and name in self._modules:
+            importlib.import_module(self._modules[name])
         if name in self._classes:
             return self._classes[name]
         if ":" in name:

@@ -84,7 +84,7 @@ def test_tied_points_get_a_cheapest_assignment_and_always_the_same(make, count, 
 @pytest.mark.parametrize("index", range(3))
 def test_conventions_are_the_exact_assignment_on_surfaces(convention, make, index):
     surface = make(index, seed=0)
-    points = sample_surface(surface, 500, rng(index)).carry(surface.vertices)
+    points = sample_surface(surface, 500, rng(index)).places(surface.vertices)
     _, expected = solve(points, TEMPLATES[convention])
     np.testing.assert_array_equal(convention_order(points, convention), expected)
 

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 
 from dine.data import deformation
 from dine.data.deformation import rbf_displacement
-from dine.data.surface import Surface
 from dine.errors import DataError
+from dine.geometry.surface import Surface
 
 pytestmark = pytest.mark.numerical
 RECIPE = {"level": 0.3, "control_percent": 5, "width": 0.4, "amplitude": 0.25, "points": 1024}

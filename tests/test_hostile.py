@@ -21,17 +21,17 @@ from fuzz.targets import Session, listing
 from samples import make_pairs, write_predictions
 
 from dine import config
-from dine.data import announced
-from dine.data.announced import RATIO, SMALL
 from dine.data.fields import TrainingFields, read_fields, write_training_fields
 from dine.data.layout import scan
 from dine.data.obtain import obtained
 from dine.data.pairs import read_pairs, write_pairs
-from dine.data.readers import read_surface
-from dine.data.surface import Surface
 from dine.errors import CheckpointError, ConfigError, DataError, DownloadError
 from dine.evaluation.predictions import Prediction, read_predictions
 from dine.files import read_json
+from dine.geometry.surface import Surface
+from dine.io import announced
+from dine.io.announced import RATIO, SMALL
+from dine.io.readers import read_surface
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import load_backbone, save_tensors
 from dine.models.state import load_state, save_state

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from dine.data.layout import check_pair, scan
-from dine.data.surface import Surface
 from dine.errors import DataError
+from dine.geometry.surface import Surface
 
 
 @pytest.fixture

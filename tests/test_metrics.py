@@ -17,16 +17,9 @@ from dine.data.pairs import (
 from dine.errors import DataError
 from dine.evaluation.metrics import evaluate
 from dine.evaluation.predictions import Prediction, read_predictions
-from dine.evaluation.quality import (
-    agreement,
-    chamfer,
-    correspondence,
-    distances,
-    fit,
-    folding,
-    neighbourhoods,
-    roughness,
-)
+from dine.evaluation.quality import correspondence
+from dine.geometry.distance import chamfer, distance_measures, distances, surface_distance
+from dine.geometry.folding import folding, neighbourhoods, roughness
 from dine.reporting.tables import COLUMNS, all_tables, load_metrics, to_latex, to_markdown
 
 pytestmark = pytest.mark.numerical
@@ -38,13 +31,13 @@ def test_distances_to_hand_made_clouds():
     b = np.array([[0.0, 3, 4], [0, 0, 0], [1, 0, 2]])
     assert distances(a, b).tolist() == [0, 1]
     assert distances(b, a).tolist() == [5, 0, 2]
-    found = fit(a, b)
+    found = surface_distance(a, b)
     assert found["hausdorff"] == 5
     assert found["chamfer"] == chamfer(a, b) == pytest.approx(1 / 2 + 29 / 3)
     assert found["chamfer_unsquared"] == pytest.approx(1 / 2 + 7 / 3)
     # Of 0, 2 and 5 with linear interpolation; the other direction's is smaller.
     assert found["hd95"] == pytest.approx(2 + 0.9 * 3)
-    assert fit(a, b, partial=True)["chamfer"] == pytest.approx(29 / 3)
+    assert surface_distance(a, b, partial=True)["chamfer"] == pytest.approx(29 / 3)
 
 
 def test_hd95_forgives_what_hausdorff_does_not():
@@ -52,10 +45,10 @@ def test_hd95_forgives_what_hausdorff_does_not():
     line[:, 0] = np.arange(100)
     away = line.copy()
     away[-1, 1] = 50
-    found = fit(line, away)
+    found = surface_distance(line, away)
     assert found["hausdorff"] == 50
     assert found["hd95"] == 0
-    assert agreement(np.zeros(3), np.full(3, 2.0))["hd95"] == 2
+    assert distance_measures(np.zeros(3), np.full(3, 2.0))["hd95"] == 2
 
 
 def test_correspondence_errors_are_counted_by_thresholds():

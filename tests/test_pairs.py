@@ -22,9 +22,10 @@ from dine.data.pairs import (
     write_variant,
 )
 from dine.data.prepare import make_pairs
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 
 pytestmark = pytest.mark.numerical
 POINTS = 64
@@ -126,7 +127,7 @@ def test_points_map_back_onto_the_meshes(pairs, inventory):
     for i in (0, 4, 9):
         for role in ("source", "target"):
             mesh = read_surface(inventory.folder / getattr(pairs, f"{role}_file")[i])
-            expected = pairs.samples(i).carry(mesh.vertices)
+            expected = pairs.samples(i).places(mesh.vertices)
             found = pairs.to_original(getattr(pairs, role)[i], i)
             np.testing.assert_allclose(found, expected, atol=1e-6)
 

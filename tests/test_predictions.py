@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 from samples import POINTS, make_pairs, write_predictions
 
+from dine.classical.predictions import classical_predictions
 from dine.cli import cli
 from dine.config import RefinedMethod
 from dine.data.corruption import make_variant
@@ -15,10 +16,9 @@ from dine.data.pairs import at_levels, read_pairs, write_pairs, write_variant
 from dine.errors import ConfigError, DataError
 from dine.evaluation.conditions import evaluation_conditions
 from dine.evaluation.predictions import Prediction, read_predictions
+from dine.evaluation.refined import refine_predictions
 from dine.files import read_json
 from dine.priors import PRIORS
-from dine.registration.classical_predictions import classical_predictions
-from dine.registration.predictions import refine_predictions
 from dine.reporting.evidence.examples import typical
 
 pytestmark = pytest.mark.numerical

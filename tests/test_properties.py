@@ -13,9 +13,10 @@ from dine.config import merge
 from dine.data import dataverse
 from dine.data.pairs import PAIR_DATASETS, read_pairs, write_pairs
 from dine.data.raw import _safe
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.files import digest, read_json, write_json
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 
 # Equal runs, and nothing kept between them.
 settings.register_profile("dine", max_examples=60, deadline=None, derandomize=True, database=None)

@@ -11,8 +11,9 @@ from importlib import resources
 import click
 import pytest
 
-from dine import cli, provenance
+from dine import cli, priors, provenance
 from dine.errors import ConfigError
+from dine.priors import PRIORS
 from dine.provenance import code_digest, code_files, folder_signature, versions
 
 
@@ -43,7 +44,24 @@ def test_only_the_classes_that_are_picked_count():
     fit = code_of("fit-prior", "pca_residual")
     assert {"priors.pca_residual", "priors.pca", "priors.fitting", "priors.sources"} <= fit
     assert "priors.flow" not in fit
-    assert "registration.bcpd" in code_of("classical", "bcpd")
+    assert "classical.bcpd" in code_of("classical", "bcpd")
+
+
+def test_priors_are_known_before_they_are_imported():
+    """By the name under which each module registers its class, and the class by its own."""
+    modules = {name: of for name, of in provenance._registered().items() if "priors" in of[0]}
+    assert sorted(modules) == PRIORS.names()
+    for name, (module,) in modules.items():
+        assert PRIORS.get(name).__module__ == module
+        exported = PRIORS.get(name).__name__
+        assert getattr(priors, exported) is PRIORS.get(name)
+        assert exported in priors.__all__
+        assert provenance._defining("dine.priors", exported) == module
+
+
+def test_a_registration_is_not_made_again_for_the_training_loop():
+    for step in ("register", "register-many", "calibrate"):
+        assert not any(name.startswith("training") for name in code_of(step, "robust_defreg"))
 
 
 def test_what_rivals_run_does_not_depend_on_the_networks():

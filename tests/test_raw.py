@@ -8,10 +8,11 @@ import trimesh
 from dine.data import raw
 from dine.data.layout import Inventory, scan
 from dine.data.raw import deform_bases, synthesise, write_dataset
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError, StorageError
 from dine.files import read_json
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 
 RECIPE = {
     "levels": [0.1, 0.4],

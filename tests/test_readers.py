@@ -8,9 +8,10 @@ import pytest
 import scipy.io
 import trimesh
 
-from dine.data.readers import READABLE_SUFFIXES, read_surface, write_surface
-from dine.data.surface import Surface
 from dine.errors import DataError
+from dine.geometry.surface import Surface
+from dine.io.readers import READABLE_SUFFIXES, read_surface
+from dine.io.writers import write_surface
 
 # Not in any order, with a repeated and an unused vertex: merging or sorting would show.
 VERTICES = np.array(

@@ -6,13 +6,13 @@ import torch
 import trimesh
 from scipy.spatial.distance import cdist
 
-from dine.models.checkpoint import load_backbone
-from dine.priors.gaussian import LOOSE, STIFF, LinearGaussian, squared_exponential
-from dine.registration.calibration import find_field
-from dine.registration.expectation import Matches, Model
-from dine.registration.refine import expected_error, refine
-from dine.registration.shared_points import SharedPoints
-from dine.training.stages import shipped_weights
+from dine.models.checkpoint import load_backbone, shipped_weights
+from dine.priors.gaussian import LinearGaussian, squared_exponential
+from dine.refinement.em import Matches, Mixture
+from dine.refinement.process import LOOSE, STIFF
+from dine.refinement.refine import Observed, Options, refine
+from dine.refinement.shared_points import SharedPoints
+from dine.registration.correspondence import predict_and_refine
 
 pytestmark = pytest.mark.numerical
 
@@ -65,7 +65,7 @@ def test_the_solve_is_the_posterior_mean(modes, rank):
         rng.normal(size=(12, 3)), rng.normal(size=(modes, 12, 3)), rng.normal(size=(12, rank))
     )
     value, precision = rng.normal(size=(12, 3)), rng.uniform(0.1, 5, size=12)
-    model = Model(rng.normal(size=(12, 3)), rng.normal(size=(7, 3)), prior, 0.01, 0)
+    model = Mixture(rng.normal(size=(12, 3)), rng.normal(size=(7, 3)), prior, 0.01, 0)
     field, energy = model.most_probable(value, precision)
     np.testing.assert_allclose(field, dense(prior, value, precision), atol=1e-9)
     # Half the squared Mahalanobis length of what the field is made of.
@@ -83,7 +83,7 @@ def test_without_rounds_it_is_the_mean_of_the_stiff_process():
     deviation = rng.uniform(0.1, 0.3, size=30)
     prior = squared_exponential(points, points, STIFF.widths, STIFF.amplitudes, STIFF.affine)
     expected = prior @ np.linalg.solve(prior + np.diag((2 * deviation) ** 2), value)
-    found = refine(points, points, value, deviation, rounds=0)
+    found = refine(points, points, Observed(value, deviation), options=Options(rounds=0)).mean
     # The root of the covariance leaves out a ten-thousandth of the variance.
     assert np.abs(found - expected).max() < 5e-3
 
@@ -94,7 +94,7 @@ def test_without_rounds_it_is_the_mean_of_the_stiff_process():
 def test_one_round_follows_the_formula(pair):
     source, target, _ = pair
     prior = STIFF.at(source)
-    model = Model(source, target, prior, STIFF.least, 0)
+    model = Mixture(source, target, prior, STIFF.least, 0)
     found = model.rounds(np.zeros_like(source), 1, variance=0.02)[1].field
     squared = ((source[:, None] - target[None]) ** 2).sum(axis=2)
     density = (1 - 0.1) / len(source) * np.exp(-squared / 0.04) / (2 * np.pi * 0.02) ** 1.5
@@ -106,7 +106,7 @@ def test_one_round_follows_the_formula(pair):
 
 def test_every_field_becomes_more_probable(pair):
     source, target, _ = pair
-    model = Model(source, target, STIFF.at(source), STIFF.least, 0)
+    model = Mixture(source, target, STIFF.at(source), STIFF.least, 0)
     found = [
         model.rounds(np.zeros_like(source), rounds)[1].improbability for rounds in (1, 2, 4, 6, 40)
     ]
@@ -119,17 +119,21 @@ def test_every_field_becomes_more_probable(pair):
 def test_the_network_is_improved_on(pair):
     source, target, truth = pair
     noisy = truth + 0.08 * np.random.default_rng(4).normal(size=truth.shape)
-    noise = np.full(len(truth), 0.08)
-    assert error(refine(source, target, noisy, noise, rounds=0), truth) < 0.6 * error(noisy, truth)
-    assert error(refine(source, target, noisy, noise), truth) < 0.01 * error(noisy, truth)
+    observed = Observed(noisy, np.full(len(truth), 0.08))
+    smoothed = refine(source, target, observed, options=Options(rounds=0)).mean
+    assert error(smoothed, truth) < 0.6 * error(noisy, truth)
+    assert error(refine(source, target, observed).mean, truth) < 0.01 * error(noisy, truth)
 
 
 def test_a_network_that_is_wrong_as_a_whole_does_no_harm(pair):
     source, target, truth = pair
     wrong = np.full_like(truth, 1.5)
     sure = np.full(len(truth), 1e-3)
-    alone = refine(source, target, None, None)
-    assert error(refine(source, target, wrong, sure), truth) <= error(alone, truth) + 1e-6
+    alone = refine(source, target).mean
+    assert (
+        error(refine(source, target, Observed(wrong, sure)).mean, truth)
+        <= error(alone, truth) + 1e-6
+    )
 
 
 def test_what_is_matched_is_held_and_its_targets_are_taken(pair):
@@ -137,7 +141,7 @@ def test_what_is_matched_is_held_and_its_targets_are_taken(pair):
     source, target, truth = pair
     nearest = cdist(source + truth, target).argmin(axis=1)
     known = source[:, 0] > 0
-    model = Model(source, target, LOOSE.at(source), 0.002, 0, Matches(known, nearest))
+    model = Mixture(source, target, LOOSE.at(source), 0.002, 0, Matches(known, nearest))
     assert model.free == np.count_nonzero(~known)
     start = model.from_matches()
     assert error(start[known], truth[known]) < 1e-3
@@ -147,7 +151,8 @@ def test_what_is_matched_is_held_and_its_targets_are_taken(pair):
     assert error(found[~known], truth[~known]) < 0.3 * error(start[~known], truth[~known])
     # With everything that is free held to be matched as well, nothing is left to look for.
     assert (
-        Model(source, target, LOOSE.at(source), 0.002, 0, Matches(known | True, nearest)).free == 0
+        Mixture(source, target, LOOSE.at(source), 0.002, 0, Matches(known | True, nearest)).free
+        == 0
     )
 
 
@@ -156,7 +161,7 @@ def test_what_is_matched_is_held_and_its_targets_are_taken(pair):
 
 def test_shared_points_are_met_exactly(pair):
     source, target, truth = pair
-    assert np.abs(refine(source, target, None, None) - truth).max() < 1e-12
+    assert np.abs(refine(source, target).mean - truth).max() < 1e-12
 
 
 def test_matching_goes_on_from_what_is_right_somewhere(pair):
@@ -220,8 +225,8 @@ def test_points_of_their_own_are_not_followed(pair):
     source, _, truth = pair
     other = organ(420, 9)
     target = other + bent(other)
-    found = refine(source, target, None, None)
-    loose = refine(source, target, None, None, prior=LOOSE.at(source))
+    found = refine(source, target).mean
+    loose = refine(source, target, prior=LOOSE.at(source)).mean
     assert error(found, truth) < error(loose, truth)
     # An ellipsoid hardly shows where along it a point went.
     assert error(found, truth) < 0.8 * np.linalg.norm(truth, axis=1).mean()
@@ -230,16 +235,16 @@ def test_points_of_their_own_are_not_followed(pair):
 def test_outliers_are_ignored(pair):
     source, target, truth = pair
     strange = np.random.default_rng(3).uniform(-1, 1, size=(100, 3))
-    found = refine(source, np.concatenate([target, strange]), None, None)
+    found = refine(source, np.concatenate([target, strange])).mean
     assert error(found, truth) < 1e-3
 
 
 def test_the_order_of_the_target_does_not_matter_and_nothing_is_random(pair):
     source, target, truth = pair
-    noise = np.full(len(truth), 0.05)
-    found = refine(source, target, 0.8 * truth, noise)
-    np.testing.assert_array_equal(refine(source, target, 0.8 * truth, noise), found)
-    np.testing.assert_allclose(refine(source, target[::-1], 0.8 * truth, noise), found, atol=1e-4)
+    observed = Observed(0.8 * truth, np.full(len(truth), 0.05))
+    found = refine(source, target, observed).mean
+    np.testing.assert_array_equal(refine(source, target, observed).mean, found)
+    np.testing.assert_allclose(refine(source, target[::-1], observed).mean, found, atol=1e-4)
 
 
 def test_a_given_prior_finishes(pair):
@@ -247,26 +252,28 @@ def test_a_given_prior_finishes(pair):
     only_shift = LinearGaussian(
         np.zeros_like(source), np.eye(3)[:, None, :].repeat(len(source), axis=1), np.zeros((400, 0))
     )
-    found = refine(source, target, truth, np.full(len(truth), 0.05), prior=only_shift)
+    observed = Observed(truth, np.full(len(truth), 0.05))
+    found = refine(source, target, observed, prior=only_shift).mean
     assert np.ptp(found, axis=0).max() < 1e-6
 
 
 def test_a_part_looks_for_the_whole(pair):
     source, target, truth = pair
     shown = source[:, 0] > 0
-    found = refine(source[shown], target, None, None, part=True)
+    found = refine(source[shown], target, options=Options(part=True)).mean
     assert error(found, truth[shown]) < 0.5 * np.linalg.norm(truth[shown], axis=1).mean()
 
 
 @pytest.mark.parametrize(("points", "targets"), [(3, 1), (1, 3), (1, 1), (8, 8), (9, 9)])
 def test_few_points(points, targets):
     source = organ(points, 5)
-    assert np.isfinite(refine(source, organ(targets, 6) + 0.1, None, None)).all()
+    assert np.isfinite(refine(source, organ(targets, 6) + 0.1).mean).all()
 
 
-def test_expected_error():
-    assert expected_error(None, 4).tolist() == [0.05] * 4
-    assert expected_error(np.array([0.0, 0.2]), 2).tolist() == [0.03, 0.2]
+def test_the_error_to_expect_of_a_network():
+    field = np.zeros((4, 3))
+    assert Observed.of_network(field, None).error.tolist() == [0.05] * 4
+    assert Observed.of_network(field[:2], np.array([0.0, 0.2])).error.tolist() == [0.03, 0.2]
 
 
 def test_the_loose_process_has_more_freedom_than_the_stiff_one():
@@ -283,5 +290,5 @@ def test_the_authors_checkpoint_is_beaten_on_its_own_demo_pairs(shared, kind):
     for name in {key.split("/")[0] for key in stored}:
         source, target = (stored[f"{name}/{x}"].astype(float) for x in ("source", "target"))
         truth = target[stored[f"{name}/target_index_of_source"]] - source
-        found, _ = find_field(backbone, source, target, torch.device("cpu"))
+        found, _ = predict_and_refine(backbone, source, target, torch.device("cpu"))
         assert error(found, truth) < 0.5 * error(stored[f"{name}/displacement"], truth)

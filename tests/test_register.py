@@ -12,18 +12,21 @@ from click.testing import CliRunner
 import dine
 from dine.cli import cli
 from dine.data.pairs import PAIR_DATASETS, PairSet, Variant, read_pairs, write_pairs, write_variant
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
-from dine.evaluation.quality import fit, folding, landmark_errors
+from dine.geometry.distance import landmark_errors, surface_distance
+from dine.geometry.folding import folding
+from dine.geometry.frame import Frame
+from dine.geometry.rigid import Alignment, check_rigid, rigid_alignment, transformed
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior
+from dine.refinement.refine import ROUNDS
+from dine.registration.assessment import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 from dine.registration.calibration import Calibration, load_calibration, plausibility
-from dine.registration.frame import Frame, check_rigid, rigid_alignment, transformed
-from dine.registration.refine import ROUNDS
-from dine.registration.register import load_model
-from dine.registration.trust import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
+from dine.registration.model import load_model
 
 pytestmark = pytest.mark.numerical
 POINTS = 1024
@@ -98,18 +101,28 @@ def test_frame_goes_there_and_back():
     assert np.allclose(frame.restore(inside), points)
 
 
-def test_fit_is_what_its_names_say():
+def test_an_alignment_goes_there_and_back():
+    points = 100 * np.random.default_rng(1).normal(size=(50, 3)) + 7
+    alignment = Alignment.of(points, turned())
+    assert np.allclose(alignment.align(points), transformed(points, turned()))
+    assert np.allclose(alignment.unalign(alignment.align(points)), points)
+    inside = alignment.normalise(points)
+    assert np.linalg.norm(inside, axis=1).max() == pytest.approx(1)
+    assert np.allclose(alignment.restore(inside), alignment.align(points))
+
+
+def test_surface_distance_is_what_its_names_say():
     rng = np.random.default_rng(2)
     a, b = rng.normal(size=(2, 40, 3))
     table = np.linalg.norm(a[:, None] - b[None], axis=2)
     there, back = table.min(axis=1), table.min(axis=0)
-    found = fit(a, b)
+    found = surface_distance(a, b)
     assert found["chamfer"] == pytest.approx((there**2).mean() + (back**2).mean())
     assert found["chamfer_unsquared"] == pytest.approx(there.mean() + back.mean())
     assert found["hausdorff"] == pytest.approx(max(there.max(), back.max()))
     expected = max(np.percentile(there, 95), np.percentile(back, 95))
     assert found["hd95"] == pytest.approx(expected)
-    assert fit(a, b, partial=True)["chamfer"] == pytest.approx((back**2).mean())
+    assert surface_distance(a, b, partial=True)["chamfer"] == pytest.approx((back**2).mean())
 
 
 def test_folding_is_the_share_turned_inside_out():
@@ -216,6 +229,8 @@ def test_registration_brings_the_source_to_its_target(pair, result):
     assert (result.moved.faces == source.faces).all()
     assert np.allclose(result.moved.vertices, source.vertices + result.displacement)
     assert result.supported.all()
+    assert result.alignment.matrix.tolist() == result.report["alignment"]
+    assert result.alignment.frame.scale == result.report["normalisation"]["scale"]
     json.dumps(result.report, allow_nan=False)
 
 

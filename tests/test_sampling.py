@@ -11,8 +11,8 @@ from dine.data.sampling import (
     sample_surface,
     sunflower_disc,
 )
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
 
 pytestmark = pytest.mark.numerical
 
@@ -44,7 +44,7 @@ def patches():
 def in_convention(surfaces, convention, count=256):
     clouds = []
     for seed, surface in enumerate(surfaces):
-        cloud = sample_surface(surface, count, rng(100 + seed)).carry(surface.vertices)
+        cloud = sample_surface(surface, count, rng(100 + seed)).places(surface.vertices)
         clouds.append(cloud[convention_order(cloud, convention)])
     return np.array(clouds)
 
@@ -54,7 +54,7 @@ def test_samples_lie_on_the_surface_and_fill_it_by_area():
     vertices = np.array([[0, 0, 0], [3, 0, 0], [0, 2, 0], [-1, 0, 0.0], [0, 0, 2]])
     surface = Surface(vertices, np.array([[0, 1, 2], [0, 4, 3]]))
     samples = sample_surface(surface, 4000, rng())
-    points = samples.carry(vertices)
+    points = samples.places(vertices)
     first = points[:, 2] == 0
     assert first.mean() == pytest.approx(0.75, abs=0.03)
     # Uniform within a triangle means that the points' mean is its centroid.
@@ -67,8 +67,8 @@ def test_carrying_is_exact_for_affine_motion():
     surface = next(closed_surfaces())
     samples = sample_surface(surface, 300, rng())
     matrix, shift = rng(1).standard_normal((3, 3)), np.array([10.0, -3.0, 0.5])
-    moved = samples.carry(surface.vertices @ matrix + shift)
-    expected = samples.carry(surface.vertices) @ matrix + shift
+    moved = samples.places(surface.vertices @ matrix + shift)
+    expected = samples.places(surface.vertices) @ matrix + shift
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-13)
 
 
@@ -77,7 +77,7 @@ def test_carrying_moves_only_points_near_the_moved_vertex():
     samples = sample_surface(surface, 500, rng())
     vertices = surface.vertices.copy()
     vertices[7] += [0, 0, 1]
-    change = samples.carry(vertices) - samples.carry(surface.vertices)
+    change = samples.places(vertices) - samples.places(surface.vertices)
     weight = np.where(samples.faces_vertices == 7, samples.weights, 0).sum(axis=1)
     assert (weight > 0).any()
     np.testing.assert_allclose(change[:, 2], weight, atol=1e-15)
@@ -89,7 +89,7 @@ def test_clouds_give_distinct_vertices_exactly():
     index = samples.faces_vertices[:, 0]
     assert sorted(index) == list(range(50))
     assert not np.array_equal(index, np.arange(50))
-    np.testing.assert_array_equal(samples.carry(cloud.vertices), cloud.vertices[index])
+    np.testing.assert_array_equal(samples.places(cloud.vertices), cloud.vertices[index])
 
 
 def test_sampling_depends_on_the_seed_alone():
@@ -133,7 +133,7 @@ def test_bad_surfaces_are_refused():
         sample_surface(dot, 5, rng())
     samples = sample_surface(next(closed_surfaces()), 50, rng())
     with pytest.raises(DataError, match="same vertices"):
-        samples.carry(np.zeros((3, 3)))
+        samples.places(np.zeros((3, 3)))
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)

@@ -24,8 +24,8 @@ from dine.data.fields import read_fields
 from dine.data.obtain import obtain
 from dine.data.pairs import read_pairs, read_seen, read_variant, write_pairs
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
-from dine.evaluation.quality import chamfer
 from dine.files import read_json, write_json
+from dine.geometry.distance import chamfer
 from dine.models.inference import predict_fields
 from dine.models.state import one_writer
 from dine.priors import FlowPrior, load_prior

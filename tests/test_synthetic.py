@@ -3,8 +3,8 @@ import pytest
 import trimesh
 from scipy.spatial import ConvexHull
 
-from dine.data.surface import Surface
 from dine.data.synthetic import FAMILIES, primitive, tissue_patch
+from dine.geometry.surface import Surface
 
 pytestmark = pytest.mark.numerical
 PRIMITIVES = range(2 * len(FAMILIES))

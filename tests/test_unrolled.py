@@ -6,9 +6,9 @@ import torch
 
 from dine.data.batch import make_batch
 from dine.errors import ConfigError
-from dine.priors.gaussian import STIFF, Smoothness
-from dine.registration.expectation import Model
-from dine.registration.refine import expected_error, refine
+from dine.refinement.em import Mixture
+from dine.refinement.process import STIFF, Smoothness
+from dine.refinement.refine import Observed, Options, refine
 from dine.training.unrolled import Refined
 
 pytestmark = pytest.mark.numerical
@@ -48,7 +48,7 @@ def test_rounds_are_those_of_the_refinement(rounds):
     found = [scans((120, 150)), scans((90, 170), seed=1)]
     refined = Refined(rounds=rounds).refined(*batch_of(found))
     for (source, target, field), result in zip(found, refined.numpy(), strict=True):
-        model = Model(source, target, STIFF.at(source), STIFF.least, 0)
+        model = Mixture(source, target, STIFF.at(source), STIFF.least, 0)
         expected, _ = model.most_probable(field, np.full(len(source), 1 / 0.1**2))
         variance = None
         for _ in range(rounds):  # one at a time, since momentum begins with the second
@@ -62,7 +62,8 @@ def test_rounds_are_those_of_the_refinement(rounds):
 
 def test_a_network_without_marginals_is_smoothed_alike():
     source, target, field = scans((80, 80))
-    expected = refine(source, target, field, expected_error(None, len(source)), rounds=0)
+    observed = Observed.of_network(field, None)
+    expected = refine(source, target, observed, options=Options(rounds=0)).mean
     batch, displacement = batch_of([(source, target, field)])
     found = Refined(rounds=0).refined(batch, displacement)[0]
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)

@@ -7,10 +7,10 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from dine.data.surface import Surface
 from dine.data.synthetic import primitive
 from dine.errors import DataError, StorageError
-from dine.registration.view import write_view
+from dine.geometry.surface import Surface
+from dine.viewer.view import View, write_view
 
 SOURCE = primitive(0, 0)
 COUNT = len(SOURCE.vertices)
@@ -62,8 +62,10 @@ def decode(entry):
     )
 
 
-def view(path, *, source=SOURCE, target=TARGET, result=RESULT, title="Title", **more):
-    write_view(path, source, target, result, title=title, **more)
+def view(
+    path, *, source=SOURCE, target=TARGET, result=RESULT, title="Title", overwrite=False, **more
+):
+    write_view(path, View(source, target, result, title, **more), overwrite=overwrite)
     return Page(path.read_text(encoding="utf-8"))
 
 
@@ -103,7 +105,7 @@ def test_every_element_that_the_program_asks_for_exists(tmp_path):
         assert {f"{part}-{layer}" for layer in ("moved", "target", "source")} <= page.ids.keys()
     assert "three.js authors" in page.of("script")[1]
     # Whatever is used of three.js has been bundled.
-    entry = (resources.files("dine.registration") / "three.entry.js").read_text()
+    entry = (resources.files("dine.viewer") / "three.entry.js").read_text()
     assert set(re.findall(r"THREE\.(\w+)", program)) <= set(re.findall(r"\w+", entry))
 
 
@@ -215,7 +217,7 @@ def sheet(side):
 
 @pytest.mark.parametrize("form", ["mesh", "triangles apart", "cloud", "nothing to simplify"])
 def test_huge_shapes_are_drawn_in_part(tmp_path, monkeypatch, form):
-    monkeypatch.setattr("dine.registration.view._MOST", 500)
+    monkeypatch.setattr("dine.viewer.view._MOST", 500)
     mesh = sheet(60)
     if form == "triangles apart":
         mesh = Surface(

@@ -7,10 +7,10 @@ import pytest
 import scipy.io
 import trimesh
 
-from dine.data.readers import READABLE_SUFFIXES, read_surface
-from dine.data.surface import Surface
 from dine.errors import DataError, StorageError
-from dine.registration.write import (
+from dine.geometry.surface import Surface
+from dine.io.readers import READABLE_SUFFIXES, read_surface
+from dine.io.writers import (
     FIELD_SUFFIXES,
     SURFACE_SUFFIXES,
     check_output,

@@ -23,9 +23,9 @@ from typing import IO, Any
 
 import requests
 
-from dine.data import announced
 from dine.errors import DownloadError, StorageError
 from dine.files import file_digest, read_json, write_json
+from dine.io import announced
 
 _HASHES = {"MD5": "md5", "SHA-1": "sha1", "SHA-256": "sha256", "SHA-512": "sha512"}
 _ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz")

@@ -32,8 +32,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from dine.data.sampling import sample_surface
-from dine.data.surface import Surface
 from dine.errors import DataError
+from dine.geometry.surface import Surface
 
 # Kernel values held at once (8 MiB of float64), whatever the number of vertices.
 _CHUNK = 1 << 20
@@ -84,7 +84,7 @@ def rbf_displacement(
         points=points,
     )
     count = max(1, round(control_percent / 100 * points))
-    controls = sample_surface(surface, count, rng).carry(surface.vertices)
+    controls = sample_surface(surface, count, rng).places(surface.vertices)
     centre, radius = _frame(surface)
     controls = (controls - centre) / radius
     moves = rng.standard_normal((count, 3)) * (amplitude * level)

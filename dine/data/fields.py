@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import h5py
 import numpy as np
 
-from dine.data import announced
 from dine.errors import DataError
 from dine.files import atomic_path
+from dine.io import announced
 
 FIELDS_FORMAT = "dine-fields"
 """Fields of one model on the training split, at the top level of the file."""

@@ -21,10 +21,10 @@ import pandas as pd
 
 from dine.data.manifest import read_manifest
 from dine.data.names import pair_id
-from dine.data.readers import READABLE_SUFFIXES
-from dine.data.surface import Surface
 from dine.errors import DataError
 from dine.files import read_json
+from dine.geometry.surface import Surface
+from dine.io.readers import READABLE_SUFFIXES
 
 CONDITIONS = ("deformation", "noise", "outliers", "incompleteness")
 

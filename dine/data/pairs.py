@@ -50,11 +50,12 @@ import numpy as np
 import scipy
 
 from dine import __version__
-from dine.data import announced
 from dine.data.names import deformation_of
 from dine.data.sampling import SurfaceSamples
 from dine.errors import ConfigError, DataError
 from dine.files import atomic_path, digest
+from dine.geometry.frame import Frame
+from dine.io import announced
 
 PAIRS_FORMAT = "dine-pairs"
 VARIANT_FORMAT = "dine-variant"
@@ -181,7 +182,11 @@ class PairSet:
 
     def to_original(self, points: np.ndarray, i: int) -> np.ndarray:
         """Points (..., 3) of pair i from the normalised frame to the units of its files."""
-        return np.asarray(points, dtype=np.float64) * self.scale[i] + self.center[i]
+        return self.frame(i).restore(np.asarray(points, dtype=np.float64))
+
+    def frame(self, i: int) -> Frame:
+        """The normalised frame of pair i."""
+        return Frame(self.center[i], self.scale[i])
 
     def samples(self, i: int) -> SurfaceSamples:
         """Where the points of pair i lie on the mesh of its source, in the same order."""

@@ -29,16 +29,17 @@ from dine.data.pairs import (
     write_pairs,
     write_variant,
 )
-from dine.data.readers import read_surface
 from dine.data.sampling import (
     SurfaceSamples,
     convention_order,
     neighbourhood_agreement,
     sample_surface,
 )
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
 from dine.files import digest
+from dine.geometry.frame import Frame
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
 from dine.progress import Progress
 
 _log = logging.getLogger(__name__)
@@ -127,8 +128,8 @@ def resample_targets(
             source, target = read_surface(pair.source), read_surface(pair.target)
             check_pair(source, target, pair.name)
             rng = keyed_rng(seed, "resampled", pair.object)
-            drawn = sample_surface(source, targets.shape[1], rng).carry(target.vertices)
-            targets[row] = (drawn - pairs.center[row]) / pairs.scale[row]
+            drawn = sample_surface(source, targets.shape[1], rng).places(target.vertices)
+            targets[row] = pairs.frame(row).normalise(drawn)
             bar.update()
     inlier = np.ones(targets.shape[:2], bool)
     write_variant(out, Variant(RESAMPLED, 1.0, targets, inlier, pairs.name), checksum)
@@ -155,9 +156,9 @@ def make_pairs(
 ) -> tuple[PairSet, list[tuple[str, str]]]:
     """Sample the pairs of condition ``deformation`` and split them.
 
-    Points are drawn on the source and carried to the target. The draw is keyed by seed and object,
-    and the convention is computed once for each distinct undeformed surface, so that all targets of
-    an object share points and order.
+    Points are drawn on the source and found again on the target. The draw is keyed by seed and
+    object, and the convention is computed once for each distinct undeformed surface, so that all
+    targets of an object share points and order.
 
     Without a published split, objects are shuffled by ``seed`` and shared out by fraction, at least
     one to each split whose fraction is not zero; or, ``by`` deformation, the pairs of each object
@@ -266,8 +267,7 @@ def _sample_all(
 class _Sampled:
     samples: SurfaceSamples
     source: np.ndarray
-    center: np.ndarray
-    scale: float
+    frame: Frame
 
 
 class _Sampler:
@@ -288,7 +288,7 @@ class _Sampler:
         check_pair(source, target, files.name)
         sampled = self._sampled(files.object, source)
         with np.errstate(over="ignore"):
-            moved = (sampled.samples.carry(target.vertices) - sampled.center) / sampled.scale
+            moved = sampled.frame.normalise(sampled.samples.places(target.vertices))
             moved = moved.astype(np.float32)
         if not np.isfinite(moved).all():
             raise DataError(
@@ -298,8 +298,8 @@ class _Sampler:
         return {
             "source": sampled.source,
             "target": moved,
-            "center": sampled.center,
-            "scale": sampled.scale,
+            "center": sampled.frame.center,
+            "scale": sampled.frame.scale,
             "vertex_index": sampled.samples.faces_vertices.astype(np.int32),
             "vertex_weight": sampled.samples.weights,
         }
@@ -315,14 +315,11 @@ class _Sampler:
         # Not keyed by the coordinates, so that a change of units or position changes no draw.
         rng = keyed_rng(self.seed, name)
         samples = sample_surface(surface, self.points, rng)
-        points = samples.carry(surface.vertices)
-        center = points.mean(axis=0)
-        scale = float(np.linalg.norm(points - center, axis=1).max())
-        if not scale > 0:
-            raise DataError(f"{surface.name}: all sampled points coincide; repair or remove it.")
-        points = (points - center) / scale
+        points = samples.places(surface.vertices)
+        frame = Frame.of(points, surface.name)
+        points = frame.normalise(points)
         order = convention_order(points, self.convention)
-        return _Sampled(samples[order], points[order].astype(np.float32), center, scale)
+        return _Sampled(samples[order], points[order].astype(np.float32), frame)
 
 
 def _relative(path: Path, folder: Path) -> str:

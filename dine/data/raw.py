@@ -31,11 +31,12 @@ from dine import __version__
 from dine.config import most_pairs_per_level
 from dine.data.deformation import check_recipe, rbf_displacement
 from dine.data.layout import Inventory
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.data.synthetic import primitive, tissue_patch
 from dine.errors import ConfigError, DataError, StorageError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json, write_text
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 from dine.provenance import code_digest
 
 logger = logging.getLogger(__name__)

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dine.data.assignment import cheapest_assignment
-from dine.data.surface import Surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
 
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
@@ -42,7 +42,7 @@ class SurfaceSamples:
         """The samples picked or reordered by an index array."""
         return SurfaceSamples(self.faces_vertices[order], self.weights[order])
 
-    def carry(self, vertices: np.ndarray) -> np.ndarray:
+    def places(self, vertices: np.ndarray) -> np.ndarray:
         """The (N, 3) float64 places of the samples on (V, 3) vertices of the same topology.
 
         Raises:
@@ -52,7 +52,7 @@ class SurfaceSamples:
         needed = int(self.faces_vertices.max()) + 1
         if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < needed:
             raise DataError(
-                f"Samples of a surface of at least {needed} vertices cannot be carried to vertices "
+                f"Samples of a surface of at least {needed} vertices have no places on vertices "
                 f"of shape {vertices.shape}; expected the same vertices in the same order."
             )
         return np.einsum("nk,nkd->nd", self.weights, vertices[self.faces_vertices])
@@ -243,7 +243,7 @@ def agreement_ceiling(
     """
 
     def draw() -> np.ndarray:
-        cloud = sample_surface(surface, points, rng).carry(surface.vertices)
+        cloud = sample_surface(surface, points, rng).places(surface.vertices)
         return _neighbours(cloud[convention_order(cloud, convention)], k)
 
     return float(np.mean([_shared(draw(), draw()) for _ in range(pairs)]))

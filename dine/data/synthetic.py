@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
-from dine.data.surface import Surface
+from dine.geometry.surface import Surface
 
 # First word of each generator's key, so that a primitive and a patch share no random numbers.
 _PRIMITIVE, _TISSUE = 1, 2

@@ -15,16 +15,10 @@ from dine.data.fields import put_names
 from dine.data.pairs import PairSet, read_pairs, read_variant_subset
 from dine.errors import ConfigError, DataError
 from dine.evaluation.predictions import read_predictions
-from dine.evaluation.quality import (
-    agreement,
-    chamfer,
-    correspondence,
-    distances,
-    folding,
-    neighbourhoods,
-    roughness,
-)
+from dine.evaluation.quality import correspondence
 from dine.files import atomic_path
+from dine.geometry.distance import chamfer, distance_measures, distances
+from dine.geometry.folding import folding, neighbourhoods, roughness
 from dine.results import CLEAN, KNOWN, UNSEEN, condition_key
 
 POINT_ERRORS_FORMAT = "dine-point-errors"
@@ -191,11 +185,13 @@ def _measure(
     moved = known.source + displacement
     moved_tree = cKDTree(moved)
     distance = distances(moved, known.target_tree)
-    clean = agreement(distance, distances(known.target, moved_tree))
+    clean = distance_measures(distance, distances(known.target, moved_tree))
     errors = correspondence(moved, known.target)
     cd_observed = clean["chamfer"]
     if seen is not None:
-        cd_observed = agreement(distances(moved, seen), distances(seen, moved_tree))["chamfer"]
+        cd_observed = distance_measures(distances(moved, seen), distances(seen, moved_tree))[
+            "chamfer"
+        ]
     field = displacement.astype(np.float64)
     values = {
         "cd": clean["chamfer"],

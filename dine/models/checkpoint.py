@@ -14,9 +14,9 @@ from torch import nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from dine import __version__
-from dine.data import announced
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.files import atomic_path
+from dine.io import announced
 from dine.models.backbones import BACKBONES, Backbone
 from dine.registry import Registry
 
@@ -28,6 +28,9 @@ _MISFITS = (TypeError, ValueError, RuntimeError, OverflowError, KeyError, IndexE
 _FACTORIES = ("empty", "zeros", "ones", "full", "eye", "arange", "rand", "randn", "empty_strided")
 
 BACKBONE_FORMAT = "dine-backbone"
+
+WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
+"""Folder of what comes with the package: weights, and their priors and calibrations."""
 
 
 def save_tensors(path: str | Path, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
@@ -93,6 +96,21 @@ def load_backbone(path: str | Path) -> tuple[Backbone, dict[str, Any]]:
         state, facts = load_tensors(path, BACKBONE_FORMAT)
     backbone = rebuilt(BACKBONES, Backbone, facts, ("backbone", "arguments"), state, path)
     return backbone, facts
+
+
+def shipped_weights(kind: str) -> Path:
+    """The pretrained weights that come with the package.
+
+    Raises:
+        ConfigError: there are none for this backbone.
+    """
+    path = WEIGHTS / f"{kind}.safetensors"
+    if not path.is_file():
+        raise ConfigError(
+            f"There are no pretrained weights for the backbone {kind!r}; set `stage1.start` to "
+            "random or to a file of weights."
+        )
+    return path
 
 
 class _Budget(TorchDispatchMode):

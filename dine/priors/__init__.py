@@ -6,14 +6,21 @@ Full field: ``pca`` (the paper's), ``pca_residual`` (what leaves the span costs,
 Single vectors: ``flow``.
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from dine.priors.base import PRIORS, Prior, load_prior
-from dine.priors.flow import FlowPrior
-from dine.priors.gaussian_process import GaussianProcessPrior
-from dine.priors.latent_flow import LatentFlowPrior
-from dine.priors.pca import PCAPrior
-from dine.priors.pca_process import PCAProcessPrior
-from dine.priors.pca_residual import PCAResidualPrior
-from dine.priors.smoothness import SmoothnessPrior
+
+if TYPE_CHECKING:
+    from dine.priors.flow import FlowPrior
+    from dine.priors.gaussian_process import GaussianProcessPrior
+    from dine.priors.latent_flow import LatentFlowPrior
+    from dine.priors.pca import PCAPrior
+    from dine.priors.pca_process import PCAProcessPrior
+    from dine.priors.pca_residual import PCAResidualPrior
+    from dine.priors.smoothness import SmoothnessPrior
 
 __all__ = [
     "PRIORS",
@@ -27,3 +34,21 @@ __all__ = [
     "SmoothnessPrior",
     "load_prior",
 ]
+
+
+_MODULES = {
+    "FlowPrior": "flow",
+    "GaussianProcessPrior": "gaussian_process",
+    "LatentFlowPrior": "latent_flow",
+    "PCAPrior": "pca",
+    "PCAProcessPrior": "pca_process",
+    "PCAResidualPrior": "pca_residual",
+    "SmoothnessPrior": "smoothness",
+}
+
+
+def __getattr__(name: str) -> Any:
+    # A registration needs one of them, and some bring libraries along.
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"dine.priors.{_MODULES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -16,7 +16,17 @@ from dine.priors.gaussian import LinearGaussian
 from dine.priors.sources import check_sources
 from dine.registry import Registry
 
-PRIORS: Registry[Prior] = Registry("prior")
+# A file of one prior needs the module of that one.
+PRIORS: Registry[Prior] = Registry(
+    "prior",
+    {
+        name: f"dine.priors.{name}"
+        for name in (
+            *("flow", "gaussian_process", "latent_flow", "pca", "pca_process", "pca_residual"),
+            "smoothness",
+        )
+    },
+)
 PRIOR_FORMAT = "dine-prior"
 
 LARGEST_SIZE = 1_000_000

@@ -1,23 +1,12 @@
-"""Gaussian fields in few dimensions: what a most probable field in closed form needs of a prior.
-
-And what is fixed of such a field's search by expectation–maximisation, at test time
-(:mod:`dine.registration.refine`) as in training (:mod:`dine.training.unrolled`): two smooth
-processes, and how targets lie around moved points.
-"""
+"""Gaussian fields in few dimensions: what a most probable field in closed form needs of a prior."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist
-
-OUTLIERS = 0.1
-"""Share of the target points that lie anywhere, and not near a moved source point."""
-BOX = 8.0
-"""Volume in which these lie, normalised frame."""
 
 
 @dataclass(frozen=True)
@@ -89,28 +78,3 @@ def covariance_root(
         root[:, column] = (row[:, 0] - known @ known[pivot]) / np.sqrt(left[pivot])
         left = np.maximum(left - root[:, column] ** 2, 0)
     return root
-
-
-class Smoothness(NamedTuple):
-    """A Gaussian process of displacements: widths and standard deviations, normalised frame.
-
-    ``affine`` is the standard deviation of an affine part, ``least`` the smallest one of the
-    distances between moved points and their targets.
-    """
-
-    widths: tuple[float, ...]
-    amplitudes: tuple[float, ...]
-    affine: float
-    least: float
-    rank: int
-
-    def at(self, points: np.ndarray) -> LinearGaussian:
-        """The prior of fields at (N, 3) points."""
-        root = covariance_root(points, self.widths, self.amplitudes, self.affine, rank=self.rank)
-        return LinearGaussian.of_kernel(root)
-
-
-# Chosen on the validation pairs of both synthetic datasets (60) and on 40 resampled ones of the
-# pretraining data.
-STIFF = Smoothness((1.5, 0.4), (0.2, 0.04), 0.05, 0.01, 128)
-LOOSE = Smoothness((1.5, 0.4, 0.25), (0.5, 0.2, 0.04), 0.5, 0.004, 200)

@@ -18,7 +18,8 @@ from dine.files import atomic_path, digest, file_digest, read_json, write_json
 from dine.progress import Progress
 from dine.provenance import code_digest
 from dine.registration.output import Outputs, save
-from dine.registration.register import Model, RegistrationResult, register
+from dine.registration.register import register
+from dine.registration.types import Model, RegistrationResult
 
 log = logging.getLogger(__name__)
 

@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from dine.data.surface import Surface
 from dine.errors import DataError
 from dine.files import write_json
-from dine.registration.register import RegistrationResult
-from dine.registration.view import write_view
-from dine.registration.write import (
+from dine.geometry.surface import Surface
+from dine.io.writers import (
     SURFACE_SUFFIXES,
     check_output,
     read_colors,
     write_field,
     write_moved,
 )
+from dine.registration.types import RegistrationResult
+from dine.viewer.view import View, write_view
 
 
 @dataclass(frozen=True)
@@ -108,25 +108,23 @@ def save(
         suffix = applied[name].suffix if applied else ".ply"
         write_moved(outputs.applied(name, suffix), surface, overwrite=overwrite)
     if view:
-        write_view(
-            outputs.view,
+        shown = View(
             _aligned_source(result),
             result.target,
             result.moved.vertices,
+            f"{Path(result.source.name).name} → {Path(result.target.name).name}",
             scalars=scalars,
             units=dict.fromkeys(scalars, "in units of the files"),
-            title=f"{Path(result.source.name).name} → {Path(result.target.name).name}",
             facts=_facts(result),
-            overwrite=overwrite,
         )
+        write_view(outputs.view, shown, overwrite=overwrite)
     write_json(outputs.report, result.report)
     return said
 
 
 def _aligned_source(result: RegistrationResult) -> Surface:
     """The source as the network got it: what is shown to deform should not also fly in."""
-    matrix = np.array(result.report["alignment"])
-    vertices = result.source.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    vertices = result.alignment.align(result.source.vertices)
     return Surface(vertices, result.source.faces, name=result.source.name)
 
 

@@ -19,9 +19,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from dine.data import announced
 from dine.errors import DataError
 from dine.files import atomic_path
+from dine.io import announced
 from dine.reporting import tables
 from dine.reporting.tables import CD_SCALE, display_name
 from dine.results import condition_key

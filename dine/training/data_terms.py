@@ -1,4 +1,4 @@
-"""How well a displaced source fits its target: the terms that training and descent minimise.
+"""How well a displaced source fits its target: what training and refinement by gradient minimise.
 
 All lengths are in the normalised frame, in which the source has unit radius; a point's residual is
 its distance d to the nearest point of the other cloud.

@@ -24,9 +24,9 @@ from dine.config import Training, check_shares
 from dine.data.loading import Batches, Request
 from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
-from dine.evaluation.quality import roughness
 from dine.files import write_text
 from dine.geometry.chamfer import chamfer_distance
+from dine.geometry.folding import roughness
 from dine.models.backbones import Backbone
 from dine.models.devices import chosen_device, leased
 from dine.models.state import Interrupted, StopRequest, load_state, one_writer, save_state

@@ -14,7 +14,7 @@ from dine.data.pairs import PairSet, read_seen
 from dine.errors import CheckpointError, ConfigError
 from dine.files import digest, file_digest, write_json, write_text
 from dine.models.backbones import BACKBONES, Backbone
-from dine.models.checkpoint import load_backbone, save_backbone
+from dine.models.checkpoint import load_backbone, save_backbone, shipped_weights
 from dine.models.devices import chosen_device
 from dine.models.inference import COMPUTE
 from dine.models.state import check_still_wanted
@@ -23,8 +23,6 @@ from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import history_csv, train
 from dine.training.objective import Objective
-
-WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
 
 def new_backbone(kind: str, arguments: dict[str, Any], seed: int) -> Backbone:
@@ -37,21 +35,6 @@ def new_backbone(kind: str, arguments: dict[str, Any], seed: int) -> Backbone:
             raise ConfigError(
                 f"The backbone {kind!r} does not take these arguments: {error}."
             ) from None
-
-
-def shipped_weights(kind: str) -> Path:
-    """The pretrained weights that come with the package.
-
-    Raises:
-        ConfigError: there are none for this backbone.
-    """
-    path = WEIGHTS / f"{kind}.safetensors"
-    if not path.is_file():
-        raise ConfigError(
-            f"There are no pretrained weights for the backbone {kind!r}; set `stage1.start` to "
-            "random or to a file of weights."
-        )
-    return path
 
 
 def starting_backbone(kind: str, arguments: dict[str, Any], start: str, seed: int) -> Backbone:

@@ -1,9 +1,9 @@
 """A data term through the refinement: what counts is the field after some rounds of it.
 
 A network whose field is refined at test time need not fit the target itself; it has to lead the
-refinement there. So the first rounds of :mod:`dine.registration.refine` are computed here in
+refinement there. So the first rounds of :mod:`dine.refinement.refine` are computed here in
 PyTorch, from the network's field and differentiable in it: the smoothing under the stiff Gaussian
-process, then expectation–maximisation as in :mod:`dine.registration.expectation`, without momentum.
+process, then expectation–maximisation as in :mod:`dine.refinement.em`, without momentum.
 
 What a field has beyond the process, such as noise from point to point, is smoothed away and costs
 nothing. All lengths are in the normalised frame.
@@ -20,8 +20,8 @@ from torch import Tensor
 from dine.data.batch import Batch
 from dine.errors import ConfigError
 from dine.geometry.chamfer import chamfer_distance
-from dine.priors.gaussian import BOX, OUTLIERS, STIFF
 from dine.priors.sources import SourceCache, members
+from dine.refinement.process import BOX, OUTLIERS, STIFF
 from dine.training.data_terms import DATA_TERMS, DataTerm, positive
 
 # Distances from which on targets are nobody's at first, so that a few of them decide nothing.

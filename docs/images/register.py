@@ -12,7 +12,7 @@ from matplotlib.colors import LightSource
 
 import dine
 from dine.data.deformation import rbf_displacement
-from dine.data.surface import Surface
+from dine.geometry.surface import Surface
 
 rng = np.random.default_rng(11)
 # A synthetic organ: a sphere with lobes.

@@ -36,9 +36,10 @@ from dine.data.layout import scan
 from dine.data.obtain import obtained
 from dine.data.pairs import PAIR_DATASETS, read_pairs, read_variant, write_pairs
 from dine.data.raw import synthesise
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.evaluation.predictions import FORMAT, Prediction, put_prediction, read_predictions
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior

@@ -12,8 +12,9 @@ from test_workflow import copy_workflow, planned, snakemake
 
 from dine.cli import cli
 from dine.data.pairs import read_pairs
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 
 NAMES = ("-dash", 'Gewebe – äöü 組織, it\'s "quoted" $HOME `x` & more')
 

@@ -111,7 +111,7 @@ CODE = {
     "code/my_package/priors.py": ONE_PRIOR,
     # Not used here.
     "dine/priors/flow.py": Counter(),
-    "dine/registration/view.py": Counter(),
+    "dine/viewer/view.py": Counter(),
     "code/my_package/data.py": Counter(),
     # Used by all.
     "dine/files.py": ALL + DATA + Counter(raw=1),

@@ -20,9 +20,10 @@ from dine import config
 from dine.cli import cli
 from dine.data.deformation import rbf_displacement
 from dine.data.pairs import read_pairs, read_variant
-from dine.data.readers import read_surface, write_surface
-from dine.data.surface import Surface
 from dine.data.synthetic import primitive
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
 from dine.results import table_names
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from dine.data.readers import write_surface
-from dine.data.surface import Surface
+from dine.geometry.surface import Surface
+from dine.io.writers import write_surface
 
 
 def bent(vertices: np.ndarray, angle: float) -> np.ndarray:

@@ -13,6 +13,7 @@ posterior needs; and once the mixture is narrow, only close pairs of points are 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -69,29 +70,11 @@ class _Matches(NamedTuple):
     pulled: np.ndarray
 
 
-def bcpd(
-    source: np.ndarray,
-    target: np.ndarray,
-    *,
-    beta: float = 2.0,
-    lam: float = 2.0,
-    outliers: float = 0.1,
-    gamma: float = 1.0,
-    kappa: float = math.inf,
-    uncertain: bool = True,
-    rank: int = 300,
-    iterations: int = 500,
-    least_iterations: int = 30,
-    tolerance: float = 1e-4,
-) -> Result:
-    """Register (N, 3) source points to (M, 3) target points.
+@dataclass(frozen=True)
+class Options:
+    """Settings of :func:`bcpd`, named as in the paper.
 
-    Both clouds are first brought to zero mean and unit variance per coordinate, as the author's
-    program does, so ``beta``, ``lam`` and ``tolerance`` mean the same whatever the units.
-
-    Args:
-        source: (N, 3) points to move.
-        target: (M, 3) points; their order does not matter.
+    Attributes:
         beta: width of the Gaussian kernel, in standard deviations of the source.
         lam: λ; displacements have an expected length of √(3 / λ) of these.
         outliers: ω in [0, 1), the share of target points that belong to no source point.
@@ -102,62 +85,107 @@ def bcpd(
         iterations: at most.
         least_iterations: at least; the variance may rest before it falls.
         tolerance: stop once σ changes less than this.
+    """
+
+    beta: float = 2.0
+    lam: float = 2.0
+    outliers: float = 0.1
+    gamma: float = 1.0
+    kappa: float = math.inf
+    uncertain: bool = True
+    rank: int = 300
+    iterations: int = 500
+    least_iterations: int = 30
+    tolerance: float = 1e-4
+
+
+def bcpd(source: np.ndarray, target: np.ndarray, options: Options | None = None) -> Result:
+    """Register (N, 3) source points to (M, 3) target points; the target's order does not matter.
+
+    Both clouds are first brought to zero mean and unit variance per coordinate, as the author's
+    program does, so ``beta``, ``lam`` and ``tolerance`` mean the same whatever the units.
 
     Raises:
         DataError: a cloud whose points coincide.
     """
+    options = options or Options()
     y, _, _ = _standardised(source, "source")
     x, center_x, unit_x = _standardised(target, "target")
-    count, dim = y.shape
-    root = covariance_root(y, (beta,), (1.0,), rank=rank, tolerance=1e-6)
-    tree = cKDTree(x)
-    # A box a little larger than the target, since points on its faces would cost nothing.
-    volume = float(np.prod(np.ptp(x, axis=0) * (len(x) + 1) / len(x)))
-    outlier = outliers / max(volume, 1e-9)
-
-    transform = Similarity(1.0, np.eye(dim), np.zeros(dim))
-    moved, spread = y, np.zeros(count)
-    mixing = np.full(count, 1 / count)
-    variance = gamma**2 * float(cdist(y, x, "sqeuclidean").mean()) / dim
-    for iteration in range(1, iterations + 1):
-        # Who belongs to whom.
-        share = (1 - outliers) * mixing / (2 * math.pi * variance) ** (dim / 2)
-        if uncertain:
-            share = share * np.exp(-0.5 * dim * transform.scale**2 * spread / variance)
-        matches = _matched(moved, x, tree, variance, share, outlier)
-        matched = np.maximum(matches.source, _LEAST_MATCHES)
-        total = float(matched.sum())
-        mean_match = matches.pulled / matched[:, None]
-
-        # The posterior of v, whose covariance is root · inverse(system) · rootᵀ.
-        weight = matched * (transform.scale**2 / variance)
-        system = (root * weight[:, None]).T @ root
-        system[np.diag_indices_from(system)] += lam
-        factor = cho_factor(system, lower=True, overwrite_a=True, check_finite=False)
-        residual = weight[:, None] * (transform.inverse(mean_match) - y)
-        u = y + root @ cho_solve(factor, root.T @ residual, check_finite=False)
-        if uncertain:
-            half = solve_triangular(factor[0], root.T, lower=True, check_finite=False)
-            spread = np.einsum("kn,kn->n", half, half)
-        if math.isfinite(kappa):
-            mixing = np.exp(digamma(kappa + matched) - digamma(kappa * count + total))
-
-        # The similarity transform and the variance of the mixture.
-        mean_spread = float(matched @ spread) / total
-        transform = _similarity(u, mean_match, matched, mean_spread)
-        moved = transform(u)
-        misfit = float(
-            matches.target @ (x**2).sum(axis=1)
-            - 2 * (matches.pulled * moved).sum()
-            + matched @ (moved**2).sum(axis=1)
-        )
-        before = variance
-        variance = misfit / (total * dim) + transform.scale**2 * mean_spread
-        variance = max(variance, _LEAST_VARIANCE)
-        resting = abs(math.sqrt(variance) - math.sqrt(before)) < tolerance
-        if resting and iteration >= least_iterations:
+    state = _State(y, x, options)
+    for iteration in range(1, options.iterations + 1):
+        before = state.variance
+        state.update()
+        resting = abs(math.sqrt(state.variance) - math.sqrt(before)) < options.tolerance
+        if resting and iteration >= options.least_iterations:
             break
-    return Result(moved * unit_x + center_x, matched, math.sqrt(variance) * unit_x, iteration)
+    moved = state.moved * unit_x + center_x
+    return Result(moved, state.matched, math.sqrt(state.variance) * unit_x, iteration)
+
+
+class _State:
+    """Everything that the iterations change, for standardised clouds y and x."""
+
+    def __init__(self, y: np.ndarray, x: np.ndarray, options: Options):
+        self.y, self.x, self.options = y, x, options
+        count, self.dim = y.shape
+        self.root = covariance_root(y, (options.beta,), (1.0,), rank=options.rank, tolerance=1e-6)
+        self.tree = cKDTree(x)
+        # A box a little larger than the target, since points on its faces would cost nothing.
+        volume = float(np.prod(np.ptp(x, axis=0) * (len(x) + 1) / len(x)))
+        self.outlier = options.outliers / max(volume, 1e-9)
+        self.transform = Similarity(1.0, np.eye(self.dim), np.zeros(self.dim))
+        self.moved, self.spread = y, np.zeros(count)
+        self.matched = np.zeros(count)
+        self.mixing = np.full(count, 1 / count)
+        self.variance = options.gamma**2 * float(cdist(y, x, "sqeuclidean").mean()) / self.dim
+
+    def update(self) -> None:
+        """One iteration: matches, then the posterior of v, then the transform and the variance."""
+        matches = self._expected_matches()
+        self.matched = np.maximum(matches.source, _LEAST_MATCHES)
+        mean_match = matches.pulled / self.matched[:, None]
+        u = self._posterior(mean_match)
+        if math.isfinite(self.options.kappa):
+            total, kappa = float(self.matched.sum()), self.options.kappa
+            prior = kappa * len(self.y)
+            self.mixing = np.exp(digamma(kappa + self.matched) - digamma(prior + total))
+        self._fit_mixture(u, matches, mean_match)
+
+    def _expected_matches(self) -> _Matches:
+        """Who belongs to whom."""
+        options, variance, dim = self.options, self.variance, self.dim
+        share = (1 - options.outliers) * self.mixing / (2 * math.pi * variance) ** (dim / 2)
+        if options.uncertain:
+            share = share * np.exp(-0.5 * dim * self.transform.scale**2 * self.spread / variance)
+        return _matched(self.moved, self.x, self.tree, variance, share, self.outlier)
+
+    def _posterior(self, mean_match: np.ndarray) -> np.ndarray:
+        """u = y + v, with v's posterior of covariance root · inverse(system) · rootᵀ."""
+        weight = self.matched * (self.transform.scale**2 / self.variance)
+        root = self.root
+        system = (root * weight[:, None]).T @ root
+        system[np.diag_indices_from(system)] += self.options.lam
+        factor = cho_factor(system, lower=True, overwrite_a=True, check_finite=False)
+        residual = weight[:, None] * (self.transform.inverse(mean_match) - self.y)
+        u = self.y + root @ cho_solve(factor, root.T @ residual, check_finite=False)
+        if self.options.uncertain:
+            half = solve_triangular(factor[0], root.T, lower=True, check_finite=False)
+            self.spread = np.einsum("kn,kn->n", half, half)
+        return u
+
+    def _fit_mixture(self, u: np.ndarray, matches: _Matches, mean_match: np.ndarray) -> None:
+        """The similarity transform and the variance of the mixture."""
+        total = float(self.matched.sum())
+        mean_spread = float(self.matched @ self.spread) / total
+        self.transform = _similarity(u, mean_match, self.matched, mean_spread)
+        self.moved = self.transform(u)
+        misfit = float(
+            matches.target @ (self.x**2).sum(axis=1)
+            - 2 * (matches.pulled * self.moved).sum()
+            + self.matched @ (self.moved**2).sum(axis=1)
+        )
+        variance = misfit / (total * self.dim) + self.transform.scale**2 * mean_spread
+        self.variance = max(variance, _LEAST_VARIANCE)
 
 
 def _standardised(points: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray, float]:

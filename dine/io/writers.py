@@ -1,4 +1,4 @@
-"""Writing what a registration gives: the moved object, and the displacement field.
+"""Writing surfaces, with what is known at their vertices, and displacement fields.
 
 Vertices keep their number and order in every format but STL, which stores each triangle on its own.
 Coordinates are written as float64, or in text with 17 digits; only STL and GLB hold float32.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -18,9 +18,9 @@ import numpy as np
 import scipy.io
 import trimesh
 
-from dine.data.surface import Surface
 from dine.errors import DataError, StorageError
 from dine.files import atomic_path
+from dine.geometry.surface import Surface
 
 _RESERVED = {"vertices", "points", "faces", "colors", "displacement", "x", "y", "z"}
 _RESERVED |= {"red", "green", "blue", "alpha"}
@@ -29,8 +29,9 @@ _RESERVED |= {"red", "green", "blue", "alpha"}
 @dataclass(frozen=True)
 class _Content:
     surface: Surface
-    colors: np.ndarray | None
-    scalars: dict[str, np.ndarray]
+    colors: np.ndarray | None = None
+    scalars: dict[str, np.ndarray] = field(default_factory=dict)
+    text: bool = False
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything by name, as the array formats store it."""
@@ -63,6 +64,31 @@ def check_output(
         raise StorageError(f"{path} is a folder; name a file in it.")
     if path.exists() and not overwrite:
         raise StorageError(f"{path} exists already; choose another name, or allow overwriting it.")
+
+
+def write_surface(path: str | os.PathLike, surface: Surface) -> None:
+    """Write a surface so that ``read_surface`` gives back exactly the same arrays.
+
+    The same surface always gives the same bytes, and a file already at ``path`` is replaced only
+    when the new one is complete. :func:`write_moved` writes more formats, and more into them.
+
+    Args:
+        path: ``.ply`` (binary, float64 vertices, faces if there are any) or, for a cloud, ``.xyz``
+            (text, three columns).
+        surface: what to write.
+
+    Raises:
+        DataError: another suffix, or a mesh to be written as ``.xyz``, which has no faces.
+        StorageError: the disk is full or the folder cannot be written.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".ply", ".xyz"):
+        raise DataError(f"{path}: surfaces are written as .ply or .xyz, not as '{path.suffix}'.")
+    if suffix == ".xyz" and surface.faces is not None:
+        raise DataError(f"{path}: .xyz holds no faces; write a mesh as .ply.")
+    with atomic_path(path) as temporary:
+        _WRITERS[suffix](temporary, _Content(surface))
 
 
 def write_moved(
@@ -98,17 +124,18 @@ def write_moved(
     check_output(path, SURFACE_SUFFIXES, overwrite=overwrite)
     suffix = Path(path).suffix.lower()
     content = _Content(
-        surface, _checked_colors(colors, surface), _checked(scalars, len(surface.vertices))
+        surface, _checked_colors(colors, surface), _checked(scalars, len(surface.vertices)), text
     )
     if suffix == ".stl" and surface.faces is None:
         raise DataError(f"{path}: STL holds triangles only; write a cloud as .ply or .xyz.")
     with atomic_path(path) as temporary:
-        if suffix == ".ply":
-            temporary.write_bytes(_ply(content, text=text))
-        else:
-            _WRITERS[suffix](temporary, content)
+        _WRITERS[suffix](temporary, content)
+    return tuple(_left_out(suffix, content))
+
+
+def _left_out(suffix: str, content: _Content) -> list[str]:
     left_out = []
-    if surface.faces is not None and suffix in _POINTS_ONLY:
+    if content.surface.faces is not None and suffix in _POINTS_ONLY:
         left_out.append("faces")
     if suffix == ".stl":
         left_out.append("shared vertices")
@@ -116,7 +143,7 @@ def write_moved(
         left_out.append("colors")
     if suffix not in _HOLD_SCALARS:
         left_out += content.scalars
-    return tuple(left_out)
+    return left_out
 
 
 def write_field(
@@ -226,7 +253,7 @@ def _checked_colors(colors: np.ndarray | None, surface: Surface) -> np.ndarray |
 # --- formats ----------------------------------------------------------------------------------
 
 
-def _ply(content: _Content, *, text: bool) -> bytes:
+def _write_ply(path: Path, content: _Content) -> None:
     """Written here because trimesh stores vertices as float32 in PLY."""
     columns = dict(zip("xyz", content.surface.vertices.T, strict=True))
     if content.colors is not None:
@@ -238,7 +265,7 @@ def _ply(content: _Content, *, text: bool) -> bytes:
     for name, column in columns.items():
         table[name] = column
     tables = [table]
-    header = ["ply", f"format {'ascii' if text else 'binary_little_endian'} 1.0"]
+    header = ["ply", f"format {'ascii' if content.text else 'binary_little_endian'} 1.0"]
     header += [f"element vertex {len(table)}"]
     header += [f"property {names[kind]} {name}" for name, kind in kinds.items()]
     if content.surface.faces is not None:
@@ -248,12 +275,13 @@ def _ply(content: _Content, *, text: bool) -> bytes:
         rows["count"], rows["index"] = 3, content.surface.faces
         tables.append(rows)
     head = "\n".join([*header, "end_header", ""]).encode()
-    if not text:
-        return head + b"".join(table.tobytes() for table in tables)
+    if not content.text:
+        path.write_bytes(head + b"".join(table.tobytes() for table in tables))
+        return
     body = "".join(" ".join(map(repr, row)) + "\n" for row in table.tolist())
     if content.surface.faces is not None:
         body += "".join(f"3 {a} {b} {c}\n" for a, b, c in content.surface.faces.tolist())
-    return head + body.encode()
+    path.write_bytes(head + body.encode())
 
 
 def _write_obj(path: Path, content: _Content) -> None:
@@ -358,6 +386,7 @@ _HOLD_SCALARS = (".ply", ".vtp", ".npz", ".h5", ".mat")
 _POINTS_ONLY = (".xyz", ".txt", ".csv", ".npy")
 
 _WRITERS: dict[str, Callable[[Path, _Content], None]] = {
+    ".ply": _write_ply,
     ".obj": _write_obj,
     ".off": _write_off,
     ".stl": _write_trimesh,
@@ -373,6 +402,6 @@ _WRITERS: dict[str, Callable[[Path, _Content], None]] = {
 }
 
 #: Suffixes that ``write_moved`` writes, in lower case with the dot.
-SURFACE_SUFFIXES: tuple[str, ...] = (".ply", *_WRITERS)
+SURFACE_SUFFIXES: tuple[str, ...] = tuple(_WRITERS)
 #: Suffixes that ``write_field`` writes.
 FIELD_SUFFIXES: tuple[str, ...] = (".npz", ".vtp")

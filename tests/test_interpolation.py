@@ -4,11 +4,11 @@ from scipy.spatial.transform import Rotation
 
 from dine.data.deformation import rbf_displacement
 from dine.data.sampling import sample_surface
-from dine.data.surface import Surface
 from dine.data.synthetic import primitive, tissue_patch
 from dine.errors import DataError
-from dine.registration import carry as module
-from dine.registration.carry import carry
+from dine.geometry import interpolation as module
+from dine.geometry.interpolation import FittedDisplacement, FittedValues
+from dine.geometry.surface import Surface
 
 pytestmark = pytest.mark.numerical
 RNG = np.random.default_rng(0)
@@ -31,13 +31,19 @@ TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * 200 + [1e
 TURN = Rotation.from_rotvec([0.3, -0.8, 0.5])
 
 
+def interpolated(points, field, queries):
+    """Three columns as a displacement, any other number as values."""
+    kind = FittedDisplacement if np.shape(field)[1:] == (3,) else FittedValues
+    return kind(points, field)(queries)
+
+
 @pytest.mark.parametrize("points", SHAPES.values(), ids=SHAPES)
 def test_constant_fields_are_exact_everywhere(points):
     queries = np.concatenate([QUERIES, QUERIES * 100])
     for value in ([1.0, -2.0, 3.0], [0.7]):
-        carried = carry(points, np.tile(value, (len(points), 1)), queries)
-        assert carried.dtype == np.float64
-        np.testing.assert_allclose(carried, np.tile(value, (100, 1)), rtol=1e-5)
+        found = interpolated(points, np.tile(value, (len(points), 1)), queries)
+        assert found.dtype == np.float64
+        np.testing.assert_allclose(found, np.tile(value, (100, 1)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["ball", "plane", "nearly a plane", "repeated", "three"])
@@ -46,30 +52,30 @@ def test_rigid_motions_are_exact_everywhere(name):
         return TURN.apply(x) - x + [5, 6, 7]
 
     for queries, tolerance in ((QUERIES, 1e-4), (QUERIES * 1e3, 1.0)):
-        carried = carry(SHAPES[name], motion(SHAPES[name]), queries)
-        np.testing.assert_allclose(carried, motion(queries), rtol=0, atol=tolerance)
+        found = interpolated(SHAPES[name], motion(SHAPES[name]), queries)
+        np.testing.assert_allclose(found, motion(queries), rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("points", [SHAPES["ball"], SHAPES["repeated"], TETRAHEDRON])
 def test_affine_fields_are_exact_within_reach(points):
     slope = np.array([[0.2, 0.1, 0], [-0.1, -0.3, 0.2], [0.05, 0, 0.4]])
-    carried = carry(points, points @ slope + 3, QUERIES)
-    np.testing.assert_allclose(carried, QUERIES @ slope + 3, rtol=0, atol=1e-8)
+    found = interpolated(points, points @ slope + 3, QUERIES)
+    np.testing.assert_allclose(found, QUERIES @ slope + 3, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("columns", [1, 2, 3, 5])
 def test_samples_get_their_own_values_back(columns):
     points = SHAPES["ball"]
     field = RNG.normal(size=(len(points), columns))
-    np.testing.assert_allclose(carry(points, field, points), field, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(interpolated(points, field, points), field, rtol=0, atol=1e-5)
 
 
 def test_coincident_samples_share_their_mean():
     field = RNG.normal(size=(70, 3))
-    carried = carry(SHAPES["repeated"], field, SHAPES["repeated"][::7])
+    found = interpolated(SHAPES["repeated"], field, SHAPES["repeated"][::7])
     means = field.reshape(10, 7, 3).mean(axis=1)
-    np.testing.assert_allclose(carried, means, rtol=0, atol=1e-5)
-    single = carry(SHAPES["all in one place"], field[:9], QUERIES)
+    np.testing.assert_allclose(found, means, rtol=0, atol=1e-5)
+    single = interpolated(SHAPES["all in one place"], field[:9], QUERIES)
     np.testing.assert_allclose(single, np.tile(field[:9].mean(axis=0), (50, 1)), atol=1e-12)
 
 
@@ -82,13 +88,13 @@ def test_anything_is_finite_and_bounded(points, columns):
     directions = RNG.normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     for distance in (0.3, 1, 2, 10, 1e6):
-        carried = carry(points, field, centre + directions * distance * radius)
-        assert np.isfinite(carried).all()
+        found = interpolated(points, field, centre + directions * distance * radius)
+        assert np.isfinite(found).all()
         if columns == 1:
-            assert carried.min() >= field.min()
-            assert carried.max() <= field.max()
+            assert found.min() >= field.min()
+            assert found.max() <= field.max()
     # Far away only a turn remains, by which a sample at one radius moves no more than it does.
-    assert np.abs(carried).max() <= 3e6 * np.abs(field).max()
+    assert np.abs(found).max() <= 3e6 * np.abs(field).max()
 
 
 def test_error_on_smooth_fields_with_noise():
@@ -99,7 +105,7 @@ def test_error_on_smooth_fields_with_noise():
     ):
         rng = np.random.default_rng(0)
         samples = sample_surface(shape, 1024, rng)
-        points = samples.carry(shape.vertices)
+        points = samples.places(shape.vertices)
         centre = points.mean(axis=0)
         radius = np.linalg.norm(points - centre, axis=1).max()
         vertices, points = (shape.vertices - centre) / radius, (points - centre) / radius
@@ -114,7 +120,7 @@ def test_error_on_smooth_fields_with_noise():
         truth = field[len(vertices) + 1024 :].reshape(len(queries), -1, 3)
         given = field[len(vertices) :][:1024] + rng.normal(size=points.shape) * 0.03
         for query, true, limit in zip(queries, truth, limits, strict=True):
-            error = np.linalg.norm(carry(points, given, query) - true, axis=1).mean()
+            error = np.linalg.norm(interpolated(points, given, query) - true, axis=1).mean()
             assert error < limit
 
 
@@ -122,28 +128,30 @@ def test_many_samples_are_averaged_in_place(monkeypatch):
     monkeypatch.setattr(module, "_MOST_SITES", 100)
     points = RNG.normal(size=(1050, 3))
     slope = RNG.normal(size=(3, 3)) * 0.3
-    np.testing.assert_allclose(carry(points, points @ slope, points), points @ slope, atol=1e-8)
+    np.testing.assert_allclose(
+        interpolated(points, points @ slope, points), points @ slope, atol=1e-8
+    )
     smooth = np.sin(points)
-    assert np.abs(carry(points, smooth, points) - smooth).mean() < 0.2
+    assert np.abs(interpolated(points, smooth, points) - smooth).mean() < 0.2
 
 
 def test_many_queries_and_none():
     points = SHAPES["ball"]
     field = RNG.normal(size=(len(points), 3))
     queries = RNG.normal(size=(120_000, 3)) * 30 + [1e3, -2e3, 5e2]
-    carried = carry(points, field, queries)
-    np.testing.assert_allclose(carried[-20:], carry(points, field, queries[-20:]), atol=1e-9)
-    assert carry(points, field, np.empty((0, 3))).shape == (0, 3)
-    assert carry(points, field[:, :1], np.empty((0, 3))).shape == (0, 1)
+    found = interpolated(points, field, queries)
+    np.testing.assert_allclose(found[-20:], interpolated(points, field, queries[-20:]), atol=1e-9)
+    assert interpolated(points, field, np.empty((0, 3))).shape == (0, 3)
+    assert interpolated(points, field[:, :1], np.empty((0, 3))).shape == (0, 1)
 
 
 def test_units_and_position_do_not_matter():
     points, field = RNG.normal(size=(50, 3)), RNG.normal(size=(50, 3)) * 0.1
-    expected = carry(points, field, QUERIES[:5] - QUERIES[:5].mean(axis=0))
+    expected = interpolated(points, field, QUERIES[:5] - QUERIES[:5].mean(axis=0))
     for scale in (1e-9, 1e9):
         queries = (QUERIES[:5] - QUERIES[:5].mean(axis=0)) * scale + scale
-        carried = carry(points * scale + scale, field * scale, queries)
-        np.testing.assert_allclose(carried / scale, expected, rtol=1e-5, atol=1e-5)
+        found = interpolated(points * scale + scale, field * scale, queries)
+        np.testing.assert_allclose(found / scale, expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -160,6 +168,25 @@ def test_units_and_position_do_not_matter():
         (np.zeros((2, 3)), np.zeros((2, 1)), np.full((1, 3), np.inf), "queries .* NaN"),
     ],
 )
-def test_what_cannot_be_carried(points, field, queries, message):
+def test_what_cannot_be_interpolated(points, field, queries, message):
     with pytest.raises(DataError, match=message):
-        carry(points, field, queries)
+        interpolated(points, field, queries)
+
+
+def test_a_field_is_fitted_once(monkeypatch):
+    points, queries = SHAPES["ball"], [QUERIES, QUERIES[:7], SHAPES["ball"]]
+    displacement, values = RNG.normal(size=(60, 3)), RNG.normal(size=(60, 1))
+    expected = [interpolated(points, f, q) for f in (displacement, values) for q in queries]
+    fitted = FittedDisplacement(points, displacement), FittedValues(points, values)
+    monkeypatch.setattr(module, "_spline", None)
+    found = [f(q) for f in fitted for q in queries]
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_displacement_has_three_columns():
+    with pytest.raises(DataError, match=r"field .* shape \(4, 2\)"):
+        FittedDisplacement(TETRAHEDRON, np.zeros((4, 2)))
+    # Three values of units of their own stay within their samples, as a displacement need not.
+    values = FittedValues(TETRAHEDRON, np.eye(4)[:, :3])(QUERIES * 10)
+    assert 0 <= values.min() <= values.max() <= 1

@@ -10,6 +10,7 @@ import base64
 import json
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -19,10 +20,10 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial import cKDTree
 
-from dine.data.surface import Surface
 from dine.errors import DataError
 from dine.files import write_text
-from dine.registration.write import check_output
+from dine.geometry.surface import Surface
+from dine.io.writers import check_output
 
 #: Suffixes that ``write_view`` writes.
 VIEW_SUFFIXES: tuple[str, ...] = (".html", ".htm")
@@ -35,18 +36,31 @@ _STRETCH = 1.5
 _MOST = 100_000
 
 
-def write_view(
-    path: str | os.PathLike,
-    source: Surface,
-    target: Surface,
-    result: np.ndarray,
-    *,
-    scalars: Mapping[str, np.ndarray] | None = None,
-    units: Mapping[str, str] | None = None,
-    title: str,
-    facts: Mapping[str, Any] | None = None,
-    overwrite: bool = False,
-) -> None:
+@dataclass(frozen=True)
+class View:
+    """What a page shows.
+
+    Attributes:
+        source: the unmoved source, V vertices.
+        target: what it was registered to, in the same frame and units.
+        result: (V, 3) moved source vertices, in their order.
+        title: heading of the page, in plain text.
+        scalars: (V,) numbers on the source vertices by displayed name, such as "distance to
+            target"; NaN where there is none. The first one is shown at first.
+        units: displayed unit by name of a scalar.
+        facts: displayed values by name, in plain text.
+    """
+
+    source: Surface
+    target: Surface
+    result: np.ndarray
+    title: str
+    scalars: Mapping[str, np.ndarray] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_view(path: str | os.PathLike, view: View, *, overwrite: bool = False) -> None:
     """Write a page to turn, overlay, colour and animate source, target and moved source.
 
     Shapes with faces are drawn as surfaces, clouds as points. Coordinates keep float32 precision
@@ -57,14 +71,7 @@ def write_view(
 
     Args:
         path: the .html file.
-        source: the unmoved source, V vertices.
-        target: what it was registered to, in the same frame and units.
-        result: (V, 3) moved source vertices, in their order.
-        scalars: (V,) numbers on the source vertices by displayed name, such as "distance to
-            target"; NaN where there is none. The first one is shown at first.
-        units: displayed unit by name of a scalar.
-        title: heading of the page, in plain text.
-        facts: displayed values by name, in plain text.
+        view: what it shows.
         overwrite: replace a file that is there already.
 
     Raises:
@@ -72,12 +79,36 @@ def write_view(
         StorageError: a file is there already, the disk is full or the folder cannot be written.
     """
     check_output(path, VIEW_SUFFIXES, overwrite=overwrite)
-    result = Surface(result, name="The result").vertices
-    if result.shape != source.vertices.shape:
+    result = Surface(view.result, name="The result").vertices
+    if result.shape != view.source.vertices.shape:
         raise DataError(
-            f"A result of {len(result)} points does not fit a source of {len(source.vertices)}; "
-            "expected one row a vertex, in the same order."
+            f"A result of {len(result)} points does not fit a source of "
+            f"{len(view.source.vertices)}; expected one row a vertex, in the same order."
         )
+    data = _data(view, result)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("dine.viewer", ""),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    page = environment.get_template("view.html").render(
+        title=view.title,
+        facts={name: str(value) for name, value in view.facts.items()},
+        layers=data["layers"],
+        names=[scalar["name"] for scalar in data["scalars"]],
+        data=_embedded(data),
+        licence=Markup(_resource("three.LICENSE.txt")),
+        library=Markup(_resource("three.min.js")),
+        program=Markup(_resource("view.js")),
+    )
+    write_text(path, page)
+
+
+def _data(view: View, result: np.ndarray) -> dict[str, Any]:
+    """What the page's program reads."""
+    source, target = view.source, view.target
     small, rows = _light(source)
     small_target, target_rows = _light(target)
     layers = [
@@ -86,8 +117,8 @@ def write_view(
         _layer("source", "Source", source, rows, "#d08a3c", opacity=45, shown=False),
     ]
     shown = [
-        _scalar(name, values, len(result), rows, (units or {}).get(name, ""))
-        for name, values in (scalars or {}).items()
+        _scalar(name, values, len(result), rows, view.units.get(name, ""))
+        for name, values in view.scalars.items()
     ]
     every = np.concatenate([source.vertices, target.vertices, result])
     centre = (every.min(axis=0) + every.max(axis=0)) / 2
@@ -96,7 +127,7 @@ def write_view(
     def normalised(vertices: np.ndarray) -> np.ndarray:
         return (vertices - centre) / radius
 
-    data = {
+    return {
         "centre": centre.tolist(),
         "radius": radius,
         "source": _shape(small, normalised)
@@ -108,24 +139,6 @@ def write_view(
         "colormap": _colors(),
         "view": _viewpoint(target.vertices),
     }
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("dine.registration", ""),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("view.html").render(
-        title=title,
-        facts={name: str(value) for name, value in (facts or {}).items()},
-        layers=layers,
-        names=[scalar["name"] for scalar in shown],
-        data=_embedded(data),
-        licence=Markup(_resource("three.LICENSE.txt")),
-        library=Markup(_resource("three.min.js")),
-        program=Markup(_resource("view.js")),
-    )
-    write_text(path, page)
 
 
 def _light(surface: Surface) -> tuple[Surface, np.ndarray]:
@@ -134,9 +147,9 @@ def _light(surface: Surface) -> tuple[Surface, np.ndarray]:
     if count <= _MOST:
         return surface, np.arange(count)
     if surface.faces is not None:
-        found = _simplified(surface)
-        if found is not None:
-            return found
+        simplified = _simplified(surface)
+        if simplified is not None:
+            return simplified
     rows = np.sort(np.random.default_rng(0).permutation(count)[:_MOST])
     return Surface(surface.vertices[rows], name=surface.name), rows
 
@@ -250,4 +263,4 @@ def _embedded(data: dict[str, Any]) -> Markup:
 
 
 def _resource(name: str) -> str:
-    return (resources.files("dine.registration") / name).read_text(encoding="utf-8")
+    return (resources.files("dine.viewer") / name).read_text(encoding="utf-8")

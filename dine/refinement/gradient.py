@@ -16,18 +16,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dine.data.batch import make_batch
+from dine.data.batch import Batch, make_batch
 from dine.errors import DataError
 from dine.geometry.graph import neighbour_graph
 from dine.priors.base import Prior
 from dine.priors.gaussian import covariance_root
-from dine.training.data_terms import DataTerm
-from dine.training.objective import Objective
 
 STEPS = 40
 LEARNING_RATE = 0.02
@@ -43,14 +42,27 @@ _MOMENTUM = 0.9
 _MEMORY = 0.95
 
 
-def descend(
+class Objective(Protocol):
+    """A data term plus a weighted penalty, such as :class:`dine.training.objective.Objective`.
+
+    ``prior`` is frozen, or None. A call gets a batch without edges in its graph, a displacement
+    (1, N, 3), and None for the truth; of what it gives, the first is the loss.
+    """
+
+    @property
+    def prior(self) -> Prior | None: ...
+
+    def __call__(
+        self, batch: Batch, displacement: Tensor, truth: Tensor | None
+    ) -> tuple[Tensor, ...]: ...
+
+
+def refine_by_gradient(
     source: np.ndarray,
     target: np.ndarray,
     displacement: np.ndarray,
+    objective: Objective,
     *,
-    data_term: DataTerm,
-    prior: Prior | None,
-    weight: float,
     steps: int = STEPS,
     learning_rate: float = LEARNING_RATE,
 ) -> np.ndarray:
@@ -63,11 +75,9 @@ def descend(
     Args:
         source: (N, 3) points.
         target: (M, 3) points.
-        displacement: (N, 3) of the network, where the descent starts.
-        data_term: how well the moved source fits; it sees a batch without edges in its graph.
-        prior: a frozen prior, or None for the data term alone.
-        weight: λ of the penalty; with 0 the prior is not evaluated at all.
-        steps: of gradient descent; with 0 the start is returned.
+        displacement: (N, 3) of the network, where the steps start.
+        objective: what to lower.
+        steps: with 0 the start is returned.
         learning_rate: root mean square of the first steps' coordinates, as the source has unit
             radius; it falls to 0 along a cosine.
 
@@ -76,23 +86,17 @@ def descend(
         DataError: a cloud is empty, not (N, 3) or not finite, or the displacement is not one
             finite vector per source point, or of another number of points than the prior's.
     """
-    source, displacement = np.asarray(source), np.asarray(displacement)
-    if displacement.shape != source.shape or not np.isfinite(displacement).all():
-        raise DataError(
-            f"Expected one finite displacement for each of the source's points; found shape "
-            f"{displacement.shape} for a source of shape {source.shape}."
-        )
-    like = _tensor_like(prior)
+    source, displacement = _checked(source, displacement)
+    like = _tensor_like(objective.prior)
     # Data terms do not look at the neighbour graph, which takes longer than a step.
     batch = make_batch([source], [target], [neighbour_graph(source, 0)], like.dtype).to(like.device)
-    objective = Objective(data_term, prior, weight)
     smoothed = _smoothing(source, like)
     field = torch.from_numpy(displacement[None].copy()).to(like).requires_grad_()
-    momentum, second = torch.zeros_like(field), like.new_zeros(())
+    adam = _Adam(field)
     best, least = None, math.inf
     for step in range(1, steps + 2):
         with torch.enable_grad():
-            loss, _, _ = objective(batch, field, None)
+            loss, *_ = objective(batch, field, None)
         value = loss.item()
         if step == 1:
             least = value
@@ -101,16 +105,37 @@ def descend(
         if step > steps:
             break
         (gradient,) = torch.autograd.grad(loss, field)
-        gradient = smoothed(gradient)
-        momentum.lerp_(gradient, 1 - _MOMENTUM)
-        second.lerp_(gradient.square().mean(), 1 - _MEMORY)
-        size = (second / (1 - _MEMORY**step)).sqrt() * (1 - _MOMENTUM**step)
         rate = learning_rate * 0.5 * (1 + math.cos(math.pi * (step - 1) / steps))
-        with torch.no_grad():
-            field -= rate * momentum / size.clamp_min(torch.finfo(like.dtype).tiny)
+        adam.step(smoothed(gradient), rate)
     if best is None:
         return displacement.copy()
     return best[0].cpu().numpy().astype(displacement.dtype)
+
+
+def _checked(source: np.ndarray, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    source, displacement = np.asarray(source), np.asarray(displacement)
+    if displacement.shape != source.shape or not np.isfinite(displacement).all():
+        raise DataError(
+            f"Expected one finite displacement for each of the source's points; found shape "
+            f"{displacement.shape} for a source of shape {source.shape}."
+        )
+    return source, displacement
+
+
+class _Adam:
+    """Adam with one second moment for the whole field."""
+
+    def __init__(self, field: Tensor):
+        self.field, self.steps = field, 0
+        self.momentum, self.second = torch.zeros_like(field), field.new_zeros(())
+
+    def step(self, gradient: Tensor, rate: float) -> None:
+        self.steps += 1
+        self.momentum.lerp_(gradient, 1 - _MOMENTUM)
+        self.second.lerp_(gradient.square().mean(), 1 - _MEMORY)
+        size = (self.second / (1 - _MEMORY**self.steps)).sqrt() * (1 - _MOMENTUM**self.steps)
+        with torch.no_grad():
+            self.field -= rate * self.momentum / size.clamp_min(torch.finfo(size.dtype).tiny)
 
 
 def _tensor_like(prior: Prior | None) -> Tensor:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dine.priors.gaussian import LinearGaussian
-from dine.registration.expectation import Matches, Model
+from dine.refinement.em import Matches, Mixture
 
 # Chosen on the validation pairs of both synthetic datasets (60) and of the pretraining (90).
 _CLOSE = 0.3  # spacings of the target
@@ -59,32 +59,33 @@ class SharedPoints:
         """
         if self._few:
             return field, 0.0
-        start, found = field, self.matches(field)
-        if found.known.mean() < _SHARED:
+        start, matches = field, self.matches(field)
+        if matches.known.mean() < _SHARED:
             return field, 0.0
         for _ in range(_ATTEMPTS):
-            field, found = self._spread(field, found, prior)
-            left = Model(self.source, self.target, prior, _LEAST, 0, found)
+            field, matches = self._propagate(field, matches, prior)
+            left = Mixture(self.source, self.target, prior, _LEAST, 0, matches)
             if left.free < 3:
                 break
             # Far from all matches the first field may know better than what they suggest.
             starts = (left.from_matches(), left.from_matches(start, _ERROR))
             searched = [left.rounds(where, _ROUNDS)[1] for where in starts]
-            field = min(searched, key=lambda result: result.improbability).field
+            field = min(searched, key=lambda estimate: estimate.improbability).field
             more = self.matches(field)
-            if more.known.sum() <= found.known.sum():
+            if more.known.sum() <= matches.known.sum():
                 break
-            found = more
-        exact = found.displacement(self.source, self.target)
-        return np.where(found.known[:, None], exact, field), float(found.known.mean())
+            matches = more
+        exact = matches.displacement(self.source, self.target)
+        field = np.where(matches.known[:, None], exact, field)
+        return field, float(matches.known.mean())
 
-    def _spread(
-        self, field: np.ndarray, found: Matches, prior: LinearGaussian
+    def _propagate(
+        self, field: np.ndarray, matches: Matches, prior: LinearGaussian
     ) -> tuple[np.ndarray, Matches]:
         """Field and matches once the matches alone lead to no more."""
         while True:
-            further = Model(self.source, self.target, prior, _LEAST, 0, found).from_matches()
+            further = Mixture(self.source, self.target, prior, _LEAST, 0, matches).from_matches()
             more = self.matches(further)
-            if more.known.sum() <= found.known.sum():
-                return field, found
-            field, found = further, more
+            if more.known.sum() <= matches.known.sum():
+                return field, matches
+            field, matches = further, more

@@ -1,4 +1,4 @@
-"""Descent at test time: downwards with every prior and data term, and nothing worse than the start.
+"""Refinement by gradient: downwards with every prior and data term, nothing worse than the start.
 
 The fields are so small and the priors so quickly fitted that only the mechanics are looked at.
 """
@@ -11,8 +11,8 @@ from test_priors import QUICK
 from dine.data.batch import make_batch
 from dine.errors import ConfigError, DataError
 from dine.priors import PRIORS
-from dine.registration import descent
-from dine.registration.descent import descend
+from dine.refinement import gradient
+from dine.refinement.gradient import refine_by_gradient
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
 
@@ -51,6 +51,11 @@ def pair(source=SOURCE):
     target = source @ np.diag([1.2, 0.9, 1.0])
     target = np.random.default_rng(1).permutation(target)[: len(source) - 2]
     return source, target, smooth_fields(1, seed=5, source=source)[0]
+
+
+def descend(source, target, displacement, *, data_term, prior, weight, **steps):
+    objective = Objective(data_term, prior, weight)
+    return refine_by_gradient(source, target, displacement, objective, **steps)
 
 
 def objective(source, target, field, term, prior=None, weight=0.0):
@@ -156,7 +161,7 @@ def test_points_that_coincide(term):
     assert np.isfinite(descend(SOURCE[:1], SOURCE, nothing[:1], **run)).all()
 
 
-@pytest.mark.parametrize(("steps", "share"), [(5, 0.8), (descent.STEPS, 0.95)])
+@pytest.mark.parametrize(("steps", "share"), [(5, 0.8), (gradient.STEPS, 0.95)])
 def test_neighbours_move_together(monkeypatch, steps, share):
     """A ragged field would fit as well: the data term cannot tell."""
     source = sphere(400)
@@ -171,7 +176,7 @@ def test_neighbours_move_together(monkeypatch, steps, share):
         return differences / np.linalg.norm(found, axis=1).mean()
 
     smooth = raggedness()
-    monkeypatch.setattr(descent, "_smoothing", lambda *arguments: lambda gradient: gradient)
+    monkeypatch.setattr(gradient, "_smoothing", lambda *arguments: lambda slope: slope)
     assert smooth < share * raggedness()
 
 

@@ -1,7 +1,8 @@
-"""Where source and target lie to each other: rigid alignment and the normalised frame."""
+"""Where source and target lie to each other: rigid alignment."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import trimesh.registration
 from scipy.spatial import cKDTree
 
 from dine.errors import DataError
+from dine.geometry.frame import Frame
 
 # A rigid motion must lower the mean squared distance this much, or deformations of round objects
 # would pass for rotations; so must starts at other rotations, or symmetric objects would be turned.
@@ -16,41 +18,47 @@ _MUCH_BETTER = 0.5
 _ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
 
 
+def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """(N, 3) points moved by a 4×4 matrix."""
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
 @dataclass(frozen=True)
-class Frame:
-    """original = normalised · scale + center.
+class Alignment:
+    """A rigid motion of the source to the target, and the normalised frame there.
 
     Attributes:
-        center: (3,) mean of the source's points, in their units.
-        scale: largest distance of one from the center, same units.
+        matrix: (4, 4) rotation and translation, from the source's coordinates to the target's.
+        frame: of the aligned source, in the target's coordinates.
     """
 
-    center: np.ndarray
-    scale: float
+    matrix: np.ndarray
+    frame: Frame
 
     @classmethod
-    def of(cls, points: np.ndarray) -> Frame:
-        """The frame of (N, 3) source points.
+    def of(cls, points: np.ndarray, matrix: np.ndarray) -> Alignment:
+        """That of (N, 3) source points which a matrix aligns.
 
         Raises:
             DataError: all points coincide.
         """
-        center = points.mean(axis=0)
-        scale = float(np.linalg.norm(points - center, axis=1).max())
-        if not scale > 0:
-            raise DataError("All points of the source coincide; expected the surface of an object.")
-        return cls(center, scale)
+        return cls(matrix, Frame.of(transformed(points, matrix)))
+
+    def align(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) points of the source in the target's coordinates."""
+        return transformed(points, self.matrix)
 
     def normalise(self, points: np.ndarray) -> np.ndarray:
-        return (points - self.center) / self.scale
+        """(N, 3) points of the source in the frame; of the target: ``frame.normalise``."""
+        return self.frame.normalise(self.align(points))
 
     def restore(self, points: np.ndarray) -> np.ndarray:
-        return points * self.scale + self.center
+        """(N, 3) points of the frame in the target's coordinates, where moved points belong."""
+        return self.frame.restore(points)
 
-
-def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """(N, 3) points moved by a 4×4 matrix."""
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
+    def unalign(self, points: np.ndarray) -> np.ndarray:
+        """(N, 3) points of the target's coordinates in the source's: undoes :meth:`align`."""
+        return (points - self.matrix[:3, 3]) @ self.matrix[:3, :3]
 
 
 def check_rigid(matrix: np.ndarray, name: str = "The given alignment") -> np.ndarray:
@@ -84,11 +92,11 @@ def rigid_alignment(source: np.ndarray, target: np.ndarray, *, partial: bool = F
     is returned: every point of the part has a counterpart in the whole, but not the other way.
     """
     if partial:
-        return np.linalg.inv(_alignment(target, source, both_ways=False))
-    return _alignment(source, target, both_ways=True)
+        return np.linalg.inv(_best_motion(target, source, both_ways=False))
+    return _best_motion(source, target, both_ways=True)
 
 
-def _alignment(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray:
+def _best_motion(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray:
     tree = cKDTree(b)
 
     def misfit(matrix: np.ndarray) -> float:
@@ -100,22 +108,30 @@ def _alignment(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray:
         matrix, _, _ = trimesh.registration.icp(a, b, initial=start, **_ICP)
         return misfit(matrix), matrix
 
-    def shifted(rotation: np.ndarray) -> np.ndarray:
-        start = np.eye(4)
-        start[:3, :3] = rotation
-        start[:3, 3] = b.mean(axis=0) - rotation @ a.mean(axis=0)
-        return start
+    def best_of(starts: Iterable[np.ndarray]) -> tuple[float, np.ndarray]:
+        return min((improved(start) for start in starts), key=lambda result: result[0])
 
+    best = (misfit(np.eye(4)), np.eye(4))
+    near = best_of([np.eye(4), _between_middles(a, b, np.eye(3))])
+    if near[0] < _MUCH_BETTER * best[0]:
+        best = near
+    turned = best_of(_between_middles(a, b, rotation) for rotation in _between_axes(a, b))
+    return turned[1] if turned[0] < _MUCH_BETTER * best[0] else best[1]
+
+
+def _between_middles(a: np.ndarray, b: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """The motion of this rotation that brings the middle of (N, 3) points to that of others."""
+    motion = np.eye(4)
+    motion[:3, :3] = rotation
+    motion[:3, 3] = b.mean(axis=0) - rotation @ a.mean(axis=0)
+    return motion
+
+
+def _between_axes(a: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+    """The four rotations that bring the principal axes of (N, 3) points onto those of others."""
     axes = [np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2] for x in (a, b)]
     rotations = []
     for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         third = np.linalg.det(axes[1].T @ np.diag([*signs, 1.0]) @ axes[0])
         rotations.append(axes[1].T @ np.diag([*signs, np.sign(third)]) @ axes[0])
-    best = (misfit(np.eye(4)), np.eye(4))
-    near = min(
-        (improved(start) for start in (np.eye(4), shifted(np.eye(3)))), key=lambda found: found[0]
-    )
-    if near[0] < _MUCH_BETTER * best[0]:
-        best = near
-    turned = min((improved(shifted(r)) for r in rotations), key=lambda found: found[0])
-    return turned[1] if turned[0] < _MUCH_BETTER * best[0] else best[1]
+    return rotations

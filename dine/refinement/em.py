@@ -16,14 +16,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from dine.priors.gaussian import BOX, OUTLIERS, LinearGaussian
+from dine.priors.gaussian import LinearGaussian
+from dine.refinement.process import BOX, OUTLIERS
 
 _SETTLED = 1e-4
 _LEAST_EXPONENT = np.float32(-60)
 _UNSEEN = 1e-9
 
 
-class Result(NamedTuple):
+class Estimate(NamedTuple):
     """A field (N, 3), the variance of its distances to the targets, and how improbable it is."""
 
     field: np.ndarray
@@ -47,10 +48,11 @@ class Matches(NamedTuple):
         return np.where(self.known[:, None], target[self.target] - source, 0.0)
 
 
-class Model:
-    """One pair under a prior; ``axis`` 0 shares every target out among source points, 1 inversely.
+class Mixture:
+    """One pair under a prior: targets as a mixture of Gaussians around moved source points.
 
-    Distances and densities are in float32, which the least standard deviations forgive.
+    ``axis`` 0 shares every target out among source points, 1 inversely. Distances and densities
+    are in float32, which the least standard deviations forgive.
     """
 
     def __init__(
@@ -164,7 +166,7 @@ class Model:
 
     def rounds(
         self, field: np.ndarray, rounds: int, variance: float | None = None
-    ) -> tuple[Result, Result]:
+    ) -> tuple[Estimate, Estimate]:
         """The fields after half of the rounds and after all, and how badly they explain targets.
 
         That is −log p(targets | field) − log p(field) up to a constant. The variance of the
@@ -176,14 +178,14 @@ class Model:
             variance = max(float(np.minimum(squared.min(axis=axis), 0.1).mean()), least)
         outlier = OUTLIERS / BOX
         last, momentum, energy, settled = field, 0, 0.0, False
-        half = Result(field, variance, np.inf)
+        half = Estimate(field, variance, np.inf)
         for number in range(rounds + 1):
             factor = (1 - OUTLIERS) / squared.shape[axis] / (2 * np.pi * variance) ** 1.5
             weight = self._densities(squared, variance)
             likelihood = factor * weight.sum(axis=axis).astype(np.float64) + outlier
             improbability = energy - float(np.log(likelihood).sum())
             if number == rounds // 2:
-                half = Result(last, variance, improbability)
+                half = Estimate(last, variance, improbability)
             if settled or number == rounds:
                 break
             share = (factor / likelihood).astype(np.float32)
@@ -191,17 +193,17 @@ class Model:
             drawn = weight @ self._target
             mass = drawn[:, 3].astype(np.float64)
             pulled = drawn[:, :3] - mass[:, None] * source[self._free]
-            found, energy = self._solve(pulled, mass, variance)
-            step = found - last
-            if momentum and ((found - field) * step).sum() < 0:
+            solved, energy = self._solve(pulled, mass, variance)
+            step = solved - last
+            if momentum and ((solved - field) * step).sum() < 0:
                 momentum = 0
             momentum += 1
             # The last field is one that maximises, not one beyond.
             settled = float((step**2).sum(axis=1).mean()) < _SETTLED**2
             beyond = 0.0 if settled or number == rounds - 1 else momentum / (momentum + 3)
-            last, field = found, found + beyond * step
+            last, field = solved, solved + beyond * step
             squared = self._squared(source + field)
             distance = float(np.vdot(weight, squared))
             variance = max(distance / (3 * max(mass.sum(), 1e-9)), least)
-        end = Result(field, variance, improbability)
+        end = Estimate(field, variance, improbability)
         return (half if number >= rounds // 2 else end), end

@@ -18,9 +18,10 @@ from dine.evaluation.conditions import (
 from dine.evaluation.predictions import Prediction, read_predictions
 from dine.files import file_digest
 from dine.priors import Prior, load_prior
-from dine.registration.descent import descend
-from dine.registration.refine import expected_error, refine
+from dine.refinement.gradient import refine_by_gradient
+from dine.refinement.refine import Observed, Options, refine
 from dine.training.data_terms import DATA_TERMS
+from dine.training.objective import Objective
 
 
 def refine_predictions(
@@ -52,15 +53,15 @@ def refine_predictions(
             )
 
         def register(row: int, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-            spread = None if start.spread is None else start.spread[row].astype(float)
+            deviation = None if start.spread is None else start.spread[row].astype(float)
             return _refined(
-                settings, fitted, source, target, start.displacement[row].astype(float), spread
+                settings, fitted, source, target, start.displacement[row].astype(float), deviation
             )
 
-        found, seconds = each_pair(condition, name, register)
+        refined, seconds = each_pair(condition, name, register)
         if start.seconds is not None:
             seconds = seconds + start.seconds
-        return prediction(condition, found, seconds)
+        return prediction(condition, refined, seconds)
 
     facts = {"predictions": file_digest(predictions), "pairs": file_digest(pairs_path)}
     conditions = evaluation_conditions(pairs_path, variants)
@@ -78,23 +79,12 @@ def _refined(
     source: np.ndarray,
     target: np.ndarray,
     displacement: np.ndarray,
-    spread: np.ndarray | None,
+    deviation: np.ndarray | None,
 ) -> np.ndarray:
     if settings.algorithm == "gradient":
-        return descend(
-            source,
-            target,
-            displacement,
-            data_term=DATA_TERMS.get(settings.data_term)(),
-            prior=prior,
-            weight=settings.weight,
-            **settings.arguments,
-        )
-    return refine(
-        source,
-        target,
-        displacement,
-        expected_error(spread, len(source)),
-        prior=prior and prior.gaussian(source),
-        **settings.arguments,
-    )
+        objective = Objective(DATA_TERMS.get(settings.data_term)(), prior, settings.weight)
+        return refine_by_gradient(source, target, displacement, objective, **settings.arguments)
+    observed = Observed.of_network(displacement, deviation)
+    gaussian = prior and prior.gaussian(source)
+    options = Options(**settings.arguments)
+    return refine(source, target, observed, prior=gaussian, options=options).mean

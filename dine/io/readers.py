@@ -1,4 +1,4 @@
-"""Reading a surface from any usual mesh, cloud or array format, and writing one back.
+"""Reading a surface from any usual mesh, cloud or array format.
 
 Correspondence rests on the vertex order, so nothing here merges, drops or reorders vertices.
 Nothing stored in a file is ever executed: pickled arrays are refused.
@@ -21,11 +21,10 @@ import numpy as np
 import scipy.io
 import trimesh
 
-from dine.data import announced
-from dine.data.surface import Surface
-from dine.data.vtk import read_vtk, read_vtp
 from dine.errors import DataError
-from dine.files import atomic_path
+from dine.geometry.surface import Surface
+from dine.io import announced
+from dine.io.vtk import read_vtk, read_vtp
 
 _Arrays = tuple[np.ndarray, np.ndarray | None]
 
@@ -75,49 +74,6 @@ def read_surface(path: str | os.PathLike) -> Surface:
             "it again, or export it again as plain triangles or points."
         ) from error
     return Surface(vertices, faces, name=str(path))
-
-
-def write_surface(path: str | os.PathLike, surface: Surface) -> None:
-    """Write a surface so that ``read_surface`` gives back exactly the same arrays.
-
-    The same surface always gives the same bytes, and a file already at ``path`` is replaced only
-    when the new one is complete.
-
-    Args:
-        path: ``.ply`` (binary, float64 vertices, faces if there are any) or, for a cloud, ``.xyz``
-            (text, three columns).
-        surface: what to write.
-
-    Raises:
-        DataError: another suffix, or a mesh to be written as ``.xyz``, which has no faces.
-        StorageError: the disk is full or the folder cannot be written.
-    """
-    path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix not in (".ply", ".xyz"):
-        raise DataError(f"{path}: surfaces are written as .ply or .xyz, not as '{path.suffix}'.")
-    if suffix == ".xyz" and surface.faces is not None:
-        raise DataError(f"{path}: .xyz holds no faces; write a mesh as .ply.")
-    with atomic_path(path) as temporary:
-        if suffix == ".ply":
-            temporary.write_bytes(_ply(surface))
-        else:
-            np.savetxt(temporary, surface.vertices, fmt="%.17g")
-
-
-def _ply(surface: Surface) -> bytes:
-    vertices = surface.vertices.astype("<f8")
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
-    header += [f"property double {axis}" for axis in "xyz"]
-    body = vertices.tobytes()
-    if surface.faces is not None:
-        header += [f"element face {len(surface.faces)}"]
-        header += ["property list uchar int vertex_indices"]
-        rows = np.empty(len(surface.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-        rows["count"] = 3
-        rows["index"] = surface.faces
-        body += rows.tobytes()
-    return "\n".join([*header, "end_header", ""]).encode() + body
 
 
 # --- meshes -----------------------------------------------------------------------------------

@@ -14,10 +14,10 @@ import numpy as np
 import trimesh.registration
 from threadpoolctl import threadpool_limits
 
+from dine.classical import bcpd
 from dine.errors import ConfigError, DataError
-from dine.registration.bcpd import bcpd
-from dine.registration.frame import transformed
-from dine.registration.refine import ROUNDS, refine
+from dine.geometry.rigid import transformed
+from dine.refinement.refine import ROUNDS, Options, refine
 from dine.registry import Registry
 
 # Defaults of "cpd" and "bcpd": of 53 and 21 settings, those with the lowest mean correspondence
@@ -69,7 +69,7 @@ class Unregistered(Classical):
 class RigidICP(Classical):
     """Rotation and translation by iterative closest points (trimesh), from where the clouds are.
 
-    Unlike :func:`dine.registration.frame.rigid_alignment`, whatever it ends at is taken.
+    Unlike :func:`dine.geometry.rigid.rigid_alignment`, whatever it ends at is taken.
 
     Args:
         iterations: at most.
@@ -149,7 +149,7 @@ class CPD(Classical):
 
 @CLASSICAL.register("bcpd")
 class BCPD(Classical):
-    """Bayesian coherent point drift (Hirose, IEEE TPAMI 2021): :func:`dine.registration.bcpd.bcpd`.
+    """Bayesian coherent point drift (Hirose, IEEE TPAMI 2021): :func:`dine.classical.bcpd.bcpd`.
 
     Args:
         beta: width of the Gaussian kernel, in standard deviations of the source.
@@ -184,12 +184,12 @@ class BCPD(Classical):
         self.tolerance = _positive("tolerance", tolerance)
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return bcpd(source, target, **vars(self)).moved
+        return bcpd.bcpd(source, target, bcpd.Options(**vars(self))).moved
 
 
 @CLASSICAL.register("smooth")
 class SmoothFields(Classical):
-    """The most probable smooth field: :func:`dine.registration.refine.refine` without a network.
+    """The most probable smooth field: :func:`dine.refinement.refine.refine` without a network.
 
     What refinement at test time achieves on its own; our method, not one from the literature.
 
@@ -201,7 +201,7 @@ class SmoothFields(Classical):
         self.rounds = int(_positive("rounds", rounds))
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return source + refine(source, target, None, None, rounds=self.rounds)
+        return source + refine(source, target, options=Options(self.rounds)).mean
 
 
 def _points(points: np.ndarray, what: str) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from dine.classical.methods import CLASSICAL
 from dine.errors import ConfigError
 from dine.evaluation.conditions import (
     Condition,
@@ -15,7 +16,6 @@ from dine.evaluation.conditions import (
 )
 from dine.evaluation.predictions import Prediction
 from dine.files import file_digest
-from dine.registration.classical import CLASSICAL
 
 
 def classical_predictions(
@@ -40,8 +40,8 @@ def classical_predictions(
         ) from None
 
     def fields(condition: Condition) -> Prediction:
-        found, seconds = each_pair(condition, name, lambda _, *clouds: method(*clouds))
-        return prediction(condition, found, seconds)
+        moved, seconds = each_pair(condition, name, lambda _, *clouds: method(*clouds))
+        return prediction(condition, moved, seconds)
 
     facts = {"pairs": file_digest(pairs_path), "name": name}
     write_predictions(out, evaluation_conditions(pairs_path, variants), fields, **facts)

@@ -1,0 +1,58 @@
+"""Distances between clouds, and of corresponding points.
+
+Definitions, units and sources of all of them: docs/metrics.md.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+
+def distances(a: np.ndarray, b: np.ndarray | cKDTree) -> np.ndarray:
+    """Distance (N,), not squared, of each of (N, 3) points to the nearest of (M, 3), or of those
+    in a tree."""
+    tree = b if isinstance(b, cKDTree) else cKDTree(b)
+    return tree.query(a)[0]
+
+
+def distance_measures(*directions: np.ndarray) -> dict[str, float]:
+    """Numbers of the nearest distances (N,), not squared, in one direction or in both.
+
+    ``chamfer`` is the paper's symmetric sum of mean squared distances (squared units),
+    ``chamfer_unsquared`` the sum of mean distances, ``hausdorff`` and ``hd95`` the larger of both
+    directions' maximum and 95th percentile.
+    """
+    return {
+        "chamfer": float(sum((d**2).mean() for d in directions)),
+        "chamfer_unsquared": float(sum(d.mean() for d in directions)),
+        "hd95": float(max(np.percentile(d, 95) for d in directions)),
+        "hausdorff": float(max(d.max() for d in directions)),
+    }
+
+
+def surface_distance(
+    moved: np.ndarray, target: np.ndarray, *, partial: bool = False
+) -> dict[str, float]:
+    """How far (N, 3) moved points are from (M, 3) target points, in their units.
+
+    Named as in :func:`distance_measures`.
+
+    With ``partial`` only the distances from the target count: source regions that the target does
+    not show are not held against the result.
+    """
+    directions = [distances(target, moved)]
+    if not partial:
+        directions.append(distances(moved, target))
+    return distance_measures(*directions)
+
+
+def chamfer(a: np.ndarray, b: np.ndarray) -> float:
+    """Symmetric squared Chamfer distance of clouds (N, 3) and (M, 3), as the paper's L_CD."""
+    return surface_distance(a, b)["chamfer"]
+
+
+def landmark_errors(moved: np.ndarray, target: np.ndarray) -> dict[str, float]:
+    """Mean and largest distance between corresponding landmarks (target registration error)."""
+    errors = np.linalg.norm(moved - target, axis=1)
+    return {"mean": float(errors.mean()), "max": float(errors.max())}

@@ -1,0 +1,42 @@
+"""What is fixed of the search for a most probable field: two smooth processes, and outliers.
+
+At test time (:mod:`dine.refinement.refine`) as in training (:mod:`dine.training.unrolled`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dine.priors.gaussian import LinearGaussian, covariance_root
+
+OUTLIERS = 0.1
+"""Share of the target points that lie anywhere, and not near a moved source point."""
+BOX = 8.0
+"""Volume in which these lie, normalised frame."""
+
+
+class Smoothness(NamedTuple):
+    """A Gaussian process of displacements: widths and standard deviations, normalised frame.
+
+    ``affine`` is the standard deviation of an affine part, ``least`` the smallest one of the
+    distances between moved points and their targets.
+    """
+
+    widths: tuple[float, ...]
+    amplitudes: tuple[float, ...]
+    affine: float
+    least: float
+    rank: int
+
+    def at(self, points: np.ndarray) -> LinearGaussian:
+        """The prior of fields at (N, 3) points."""
+        root = covariance_root(points, self.widths, self.amplitudes, self.affine, rank=self.rank)
+        return LinearGaussian.of_kernel(root)
+
+
+# Chosen on the validation pairs of both synthetic datasets (60) and on 40 resampled ones of the
+# pretraining data.
+STIFF = Smoothness((1.5, 0.4), (0.2, 0.04), 0.05, 0.01, 128)
+LOOSE = Smoothness((1.5, 0.4, 0.25), (0.5, 0.2, 0.04), 0.5, 0.004, 200)

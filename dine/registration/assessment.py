@@ -1,0 +1,185 @@
+"""How far to trust a registration: what is measured of it, and a verdict from that."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dine.geometry.distance import surface_distance
+from dine.geometry.interpolation import FittedValues
+from dine.registration.calibration import Calibration, field_values
+from dine.registration.shapes import dense_points
+from dine.registration.types import (
+    Correspondence,
+    ExpectedError,
+    Model,
+    Motion,
+    Pair,
+    Settings,
+    Trust,
+)
+
+_RARE = 99.0
+_FOLDED = 0.02
+# Less is within what two draws of points from one surface make of a field.
+_LOWERED = 0.5
+# 5 % of the diameter, at which the evaluation calls a point lost.
+_INCONSISTENT = 0.1
+
+GOOD, DOUBTFUL, IMPLAUSIBLE = "plausible", "doubtful", "implausible"
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is measured of a result.
+
+    Attributes:
+        before: distances of source and target as they were, in the units of the source; named as
+            in :func:`~dine.geometry.distance.distance_measures`.
+        aligned: the same after rigid alignment.
+        after: the same after registration.
+        normalised: values of the field in the normalised frame, named as in a calibration.
+        checks: what needs no validation pairs; see :func:`assess`.
+    """
+
+    before: dict[str, float]
+    aligned: dict[str, float]
+    after: dict[str, float]
+    normalised: dict[str, float]
+    checks: dict[str, float]
+
+
+def expected_error(
+    calibration: Calibration | None, correspondence: Correspondence, pair: Pair
+) -> ExpectedError | None:
+    """The calibrated error of all vertices and points; None without calibration or indicator."""
+    if calibration is None or correspondence.indicator is None:
+        return None
+    error = calibration.expected_error(correspondence.indicator)
+    everywhere = FittedValues(correspondence.start, error[:, None])
+    vertices = everywhere(pair.alignment.normalise(pair.source.vertices))[:, 0]
+    scale = pair.alignment.frame.scale
+    return ExpectedError(vertices * scale, error * scale)
+
+
+def measure(
+    pair: Pair,
+    correspondence: Correspondence,
+    motion: Motion,
+    model: Model,
+    settings: Settings,
+    expected: ExpectedError | None,
+) -> Measures:
+    """Distances on dense points, values of the field as a calibration knows them, and checks."""
+    partial = settings.partial
+    source, target = dense_points(pair.source), dense_points(pair.target)
+    aligned = surface_distance(pair.alignment.align(source), target, partial=partial)
+    after = surface_distance(motion(source), target, partial=partial)
+    checks = {"remaining": _ratio(after["chamfer"], aligned["chamfer"])}
+    if correspondence.inconsistency is not None:
+        checks["inconsistency"] = correspondence.inconsistency
+    if expected is not None:
+        moved_by = float(np.linalg.norm(correspondence.field, axis=1).mean())
+        checks["uncertain"] = _ratio(expected.mean, moved_by * pair.alignment.frame.scale)
+    # Where points come in another order than the prior's, it says nothing of their field.
+    prior = model.prior if model.convention != "none" else None
+    start, field, goal = correspondence.start, correspondence.field, correspondence.goal
+    values = field_values(start, field, goal, prior, partial=partial)
+    before = surface_distance(source, target, partial=partial)
+    return Measures(before, aligned, after, values, checks)
+
+
+def _ratio(value: float, of: float) -> float:
+    return value / of if of > 0 else 1.0
+
+
+_UNLIKE = {
+    "initial": "Source and target differ more than {p:.0f} % of the validation pairs did before "
+    "registration; the model has not been tested on such a pair.",
+    "final": "The moved source fits the target worse than {p:.0f} % of the validation pairs did.",
+    "reach": "The largest displacement exceeds that of {p:.0f} % of the validation pairs.",
+    "in_span": "Under the prior the field is less likely than {p:.0f} % of the validation fields.",
+    "residual": "The field lies further outside the prior's principal components than {p:.0f} % of "
+    "the validation fields.",
+}
+_SERIOUS = {"final", "in_span", "residual"}
+
+
+def assess(
+    calibration: Calibration | None,
+    values: Mapping[str, float],
+    expected_error: float | None,
+    *,
+    checks: Mapping[str, float] | None = None,
+    notes: tuple[str, ...] = (),
+) -> Trust:
+    """Compare values of a result (normalised frame, names as in the calibration) with the rest.
+
+    ``checks`` need no validation pairs: ``remaining``, the Chamfer distance that is left, as a
+    share of that before (after rigid alignment); ``uncertain``, the expected error as a share of
+    the displacement, means of both; ``inconsistency``, how far points end up from where they began
+    (mean, normalised) when registered to the target and back.
+    """
+    reasons = [*notes, *_from_checks(checks or {})]
+    percentiles: dict[str, float] = {}
+    serious, usual = 0, 0.0
+    folded = values.get("folding", 0.0)
+    if folded > _FOLDED:
+        reasons.append(
+            f"The field turns {100 * folded:.0f} % of the neighbourhoods inside out, which tissue "
+            "does not do."
+        )
+    if calibration is None:
+        reasons.append(
+            "There is no calibration for these weights and settings, so nothing more can be said."
+        )
+    else:
+        percentiles, unlike, serious = _compared(calibration, values)
+        reasons += unlike
+        usual = max(calibration.reference["folding"])
+    if serious >= 2 or folded > max(5 * _FOLDED, 2 * usual):
+        verdict = IMPLAUSIBLE
+    else:
+        verdict = DOUBTFUL if reasons else GOOD
+    return Trust(verdict, tuple(reasons), percentiles, expected_error)
+
+
+def _from_checks(checks: Mapping[str, float]) -> list[str]:
+    """What speaks against a result, whatever it was calibrated with."""
+    reasons = []
+    if checks.get("remaining", 0.0) > _LOWERED:
+        reasons.append(
+            f"{100 * checks['remaining']:.0f} % of the Chamfer distance before is left: what was "
+            "moved may be noise, and the source as it was (or rigidly aligned) as good."
+        )
+    if checks.get("uncertain", 0.0) > 1:
+        reasons.append(
+            "The expected error is larger than the displacement found, so there may be none."
+        )
+    if checks.get("inconsistency", 0.0) > _INCONSISTENT:
+        reasons.append(
+            "Registered to the target and back, points end up "
+            f"{100 * checks['inconsistency']:.0f} % of the object's radius from where they began, "
+            "so the correspondence is uncertain however well the surfaces fit."
+        )
+    return reasons
+
+
+def _compared(
+    calibration: Calibration, values: Mapping[str, float]
+) -> tuple[dict[str, float], list[str], int]:
+    """Percentiles among the validation pairs, what is unlike them, and how serious that is."""
+    percentiles, reasons, serious = {}, [], 0
+    for name, value in values.items():
+        if name not in calibration.reference:
+            continue
+        percentiles[name] = calibration.percentile(name, value)
+        highest = calibration.reference[name][-1]
+        if name in _UNLIKE and percentiles[name] >= _RARE and value > highest:
+            reasons.append(_UNLIKE[name].format(p=min(percentiles[name], 100)))
+            serious += name in _SERIOUS
+            # Four times what was ever seen is no matter of percentiles any more.
+            serious += name in _SERIOUS and value > 4 * highest
+    return percentiles, reasons, serious

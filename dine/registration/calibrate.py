@@ -1,0 +1,189 @@
+"""Learning a calibration: fitted on validation pairs of known correspondence, and checked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from dine.data.pairs import PairSet, read_seen
+from dine.errors import DataError
+from dine.files import atomic_path, file_digest
+from dine.models.backbones import Backbone
+from dine.models.checkpoint import load_backbone
+from dine.priors.base import Prior, load_prior
+from dine.progress import Progress
+from dine.refinement.refine import ROUNDS
+from dine.registration.calibration import Calibration, field_values
+from dine.registration.correspondence import predict_and_refine
+
+_BINS = 20
+_EXACT = 1e-9  # object radii
+_LIKELY = 90
+
+
+class _Measured(NamedTuple):
+    """Of all points (n,) of a split what tells their errors apart, and these; of its pairs the
+    values that a calibration has references for."""
+
+    spread: np.ndarray
+    error: np.ndarray
+    reference: dict[str, list[float]]
+
+
+def calibrate(
+    model: Path,
+    pairs_paths: list[Path],
+    out: Path,
+    *,
+    prior: Path | None,
+    device: torch.device,
+    targets: list[Path] | None = None,
+) -> None:
+    """Fit on the validation split, check on the test split; write JSON and, beside it, a plot.
+
+    ``targets`` are variants of all pairs of each file, such as resampled ones, to register to.
+
+    Raises:
+        DataError: a split has no pairs, or source and target share their points: refinement then
+            matches them exactly, which says nothing of two scans.
+    """
+    backbone, _ = load_backbone(model)
+    fitted = load_prior(prior) if prior else None
+    measured = {}
+    for split in ("val", "test"):
+        pairs, seen = read_seen(pairs_paths, targets, split)
+        if len(pairs) == 0:
+            raise DataError(f"There are no {split} pairs to calibrate with.")
+        name = f"calibration, {split}"
+        measured[split] = _measure(backbone, fitted, pairs, seen, device, name)
+        if np.median(measured[split].error) < _EXACT:
+            raise DataError(
+                "Sources and targets hold the same points, which are matched exactly, so there are "
+                "no errors to learn from; give targets of other points (`dine resample`, "
+                "`--targets`)."
+            )
+    learned = _learned(measured["val"])
+    learned.facts.update(
+        model=file_digest(model),
+        prior=file_digest(prior) if prior else None,
+        convention=str(pairs.attributes.get("convention", "none")),
+        points=pairs.source.shape[1],
+        origin=str(pairs.attributes.get("origin", "unknown")),
+        resampled=bool(targets),
+        rounds=ROUNDS,
+        validation_pairs=len(measured["val"].reference["initial"]),
+        test_pairs=len(measured["test"].reference["initial"]),
+        **_checked(learned, measured["test"]),
+    )
+    learned.save(out)
+    _plot(learned, measured["test"], out.with_suffix(".png"))
+
+
+def _measure(
+    backbone: Backbone,
+    prior: Prior | None,
+    pairs: PairSet,
+    seen: np.ndarray | None,
+    device: torch.device,
+    name: str,
+) -> _Measured:
+    spreads, errors = [], []
+    reference: dict[str, list[float]] = {}
+    with Progress(name, len(pairs), unit="pair") as progress:
+        for i in range(len(pairs)):
+            source, target = (x[i].astype(np.float64) for x in (pairs.source, pairs.target))
+            goal = target if seen is None else seen[i].astype(np.float64)
+            goal = goal[np.random.default_rng([3, i]).permutation(len(goal))]
+            field, spread = predict_and_refine(backbone, source, goal, device)
+            if spread is None:
+                raise DataError("This backbone has no marginals; calibrate it with refinement.")
+            spreads.append(spread)
+            errors.append(np.linalg.norm(source + field - target, axis=1))
+            for key, value in field_values(source, field, goal, prior).items():
+                reference.setdefault(key, []).append(value)
+            progress.update()
+    return _Measured(np.concatenate(spreads), np.concatenate(errors), reference)
+
+
+def _learned(measured: _Measured) -> Calibration:
+    """Mean errors and bounds in bins of equally many points, made to grow."""
+    from sklearn.isotonic import IsotonicRegression
+
+    edges = _edges(measured.spread)
+    if len(edges) < 3:
+        raise DataError("All points moved alike; there is nothing to learn errors from.")
+    groups = _in_bins(measured.spread, measured.error, edges)
+    middle = [
+        float(np.median(group)) for group in _in_bins(measured.spread, measured.spread, edges)
+    ]
+    weight = [len(group) for group in groups]
+
+    def monotone(values: list[float]) -> list[float]:
+        return IsotonicRegression().fit_transform(middle, values, sample_weight=weight).tolist()
+
+    return Calibration(
+        spread=middle,
+        error=monotone([float(group.mean()) for group in groups]),
+        likely=monotone([float(np.percentile(group, _LIKELY)) for group in groups]),
+        reference={name: sorted(values) for name, values in measured.reference.items()},
+    )
+
+
+def _checked(calibration: Calibration, measured: _Measured) -> dict[str, Any]:
+    """How well it holds elsewhere."""
+    from scipy.stats import spearmanr
+
+    spread, error, _ = measured
+    return {
+        "test_inside_likely": float((error <= calibration.likely_error(spread)).mean()),
+        "test_rank_correlation": float(spearmanr(spread, error).statistic),
+        "test_mean_error": float(error.mean()),
+        "test_mean_expected": float(calibration.expected_error(spread).mean()),
+    }
+
+
+def _edges(spread: np.ndarray) -> np.ndarray:
+    return np.unique(np.quantile(spread, np.linspace(0, 1, _BINS + 1)))
+
+
+def _in_bins(spread: np.ndarray, error: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
+    place = np.clip(np.searchsorted(edges, spread, side="right") - 1, 0, len(edges) - 2)
+    return [error[place == number] for number in range(len(edges) - 1)]
+
+
+def _plot(calibration: Calibration, measured: _Measured, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    spread, error, _ = measured
+    edges = _edges(spread)
+    groups = _in_bins(spread, error, edges)
+    middle = [np.median(group) for group in _in_bins(spread, spread, edges)]
+    figure, axes = plt.subplots(figsize=(5.2, 4), layout="constrained")
+    axes.plot(calibration.spread, calibration.error, color="#3f7fc4", label="expected error")
+    axes.plot(
+        calibration.spread, calibration.likely, "--", color="#3f7fc4", label="90 % of errors below"
+    )
+    axes.plot(middle, [g.mean() for g in groups], "o", color="#d08a3c", label="test pairs: mean")
+    axes.plot(
+        middle,
+        [np.percentile(g, _LIKELY) for g in groups],
+        "^",
+        color="#d08a3c",
+        label="test pairs: 90th percentile",
+    )
+    axes.set(
+        xlabel="displacement, plus its distance from the network's (object radii)",
+        ylabel="distance from the true place (object radii)",
+    )
+    axes.legend(frameon=False)
+    inside = calibration.facts["test_inside_likely"]
+    axes.set_title(f"{100 * inside:.0f} % of test errors within the 90 % bound", fontsize=10)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=150, format="png")
+    plt.close(figure)

@@ -1,0 +1,144 @@
+"""Which point went where: alignment, the network's field, its refinement, and the way back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from dine.data.batch import make_batch
+from dine.data.sampling import convention_order
+from dine.errors import ConfigError, DataError
+from dine.geometry.distance import distances
+from dine.geometry.frame import Frame
+from dine.geometry.interpolation import FittedDisplacement
+from dine.geometry.rigid import Alignment, check_rigid, rigid_alignment
+from dine.geometry.surface import Surface
+from dine.models.backbones import Backbone, marginal_deviation
+from dine.refinement.refine import ROUNDS, Observed, Options, refine
+from dine.registration.shapes import FEWEST, drawn
+from dine.registration.types import Correspondence, Model, Pair, Settings
+
+# A source point is shown by the target if a target point ends up within so many spacings of it.
+_RETURN = 3.0
+
+
+def aligned_pair(source: Surface, target: Surface, settings: Settings, convention: str) -> Pair:
+    """Points of both, drawn, aligned and normalised; those of the source in a convention.
+
+    Raises:
+        DataError: too few points, points on a line, or a matrix that is not rigid.
+        ConfigError: unusable settings.
+    """
+    rng = np.random.default_rng([4, settings.seed])
+    samples = drawn(source, settings.points, rng, "source")
+    seen = drawn(target, settings.points, rng, "target").places(target.vertices)
+    places = samples.places(source.vertices)
+    alignment = Alignment.of(places, _motion(settings, places, seen))
+    start = alignment.normalise(places)
+    order = convention_order(start, convention)
+    goal = alignment.frame.normalise(seen)
+    return Pair(source, target, alignment, places[order], start[order], goal)
+
+
+def _motion(settings: Settings, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    how = settings.prealign
+    if not isinstance(how, str):
+        return check_rigid(how)
+    if how == "off":
+        return np.eye(4)
+    if how == "auto":
+        return rigid_alignment(source, target, partial=settings.partial)
+    raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
+
+
+def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:
+    """Where the source's points belong.
+
+    Raises:
+        ConfigError: a negative number of rounds.
+        DataError: with ``partial``, the part ends up beside the source.
+    """
+    rounds = settings.rounds
+    if rounds < 0:
+        raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
+    if settings.partial:
+        return _from_part(pair.start, pair.goal, rounds)
+    there = _whole(model.backbone, pair.start, pair.goal, settings)
+    # The way back has a frame of its own, in which the target is the source.
+    frame = Frame.of(pair.goal)
+    seen, whole = frame.normalise(pair.goal), frame.normalise(pair.start)
+    back = _whole(model.backbone, seen, whole, settings).field * frame.scale
+    return replace(there, inconsistency=_inconsistency(there, back))
+
+
+def _whole(
+    backbone: Backbone, start: np.ndarray, goal: np.ndarray, settings: Settings
+) -> Correspondence:
+    field, indicator = predict_and_refine(backbone, start, goal, settings.device, settings.rounds)
+    return Correspondence(start, goal, field, indicator, np.ones(len(start), bool))
+
+
+@torch.no_grad()
+def predict_and_refine(
+    backbone: Backbone,
+    source: np.ndarray,
+    target: np.ndarray,
+    device: torch.device,
+    rounds: int = ROUNDS,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Displacement (N, 3) and what tells its errors apart (N,), float64, normalised frame.
+
+    The network's field, refined in some rounds (see :func:`~dine.refinement.refine.refine`); 0
+    leaves it as it is. Errors of the network's own field grow with the standard deviation of its
+    marginals (None from a backbone without). What is left after refinement has little to do with
+    that, but grows with how far a point moved, and with how far the network would have moved it
+    elsewhere: their sum is taken. How well it ranks errors is among the facts of a calibration.
+    """
+    batch = make_batch([source], [target]).to(device)
+    result = backbone.to(device).eval()(batch)
+    predicted = result.displacement[0].double().cpu().numpy()
+    deviation = marginal_deviation(backbone, result)
+    deviation = None if deviation is None else deviation[0].double().cpu().numpy()
+    if rounds == 0:
+        return predicted, deviation
+    observed = Observed.of_network(predicted, deviation)
+    refined = refine(source, target, observed, options=Options(rounds)).mean
+    elsewhere = np.linalg.norm(refined - predicted, axis=1)
+    return refined, np.linalg.norm(refined, axis=1) + elsewhere
+
+
+def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> Correspondence:
+    """Source points whose target is a part of them.
+
+    The part is registered to the whole, in which each of its points has a counterpart; the inverse
+    is known where they end up and interpolated from there. Networks mistake parts for wholes, so
+    they have no say.
+
+    Raises:
+        DataError: the part ends up beside the source.
+    """
+    frame = Frame.of(goal)
+    part, whole = frame.normalise(goal), frame.normalise(start)
+    back = refine(part, whole, options=Options(rounds, part=True)).mean * frame.scale
+    places = goal + back
+    reach = _RETURN * float(np.median(cKDTree(start).query(start, k=2)[0][:, 1]))
+    supported = distances(start, places) < reach
+    if supported.sum() < FEWEST:
+        raise DataError(
+            "Hardly any part of the source is found in the target; check that both show the same "
+            "object, or leave out `partial`."
+        )
+    return Correspondence(start, goal, FittedDisplacement(places, -back)(start), None, supported)
+
+
+def _inconsistency(there: Correspondence, back: np.ndarray) -> float:
+    """Mean distance from where they began of points moved to the target and, by the field (M, 3)
+    of the opposite registration, back; normalised frame.
+
+    A wrong correspondence can fit as well as the right one, but is seldom found from both sides.
+    """
+    returned = there.field + FittedDisplacement(there.goal, back)(there.moved)
+    return float(np.linalg.norm(returned, axis=1).mean())

@@ -1,0 +1,145 @@
+"""What is registered: scans in any accepted form, whether they can be, and points drawn on them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dine.data.sampling import SurfaceSamples, sample_surface
+from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+
+Shape = str | Path | Surface | np.ndarray | tuple[np.ndarray, np.ndarray]
+"""A file, a surface, (V, 3) points, or vertices and faces."""
+
+POINTS = 1024
+FEWEST = 16
+# Extents that differ by more than this come from other units or other objects.
+_LARGEST_RATIO = 3.0
+# Tissue hardly grows or shrinks that much, but from inches to centimetres it is 2.54.
+_UNUSUAL_RATIO = 1.5
+_UNITS = {1000: "metres and millimetres", 100: "metres and centimetres", 10: "cm and mm"}
+_UNITS |= {25.4: "inches and millimetres", 2.54: "inches and centimetres"}
+
+
+def as_surface(shape: Shape, name: str) -> Surface:
+    """Any accepted form as a surface.
+
+    Raises:
+        DataError: a file that cannot be read, or an array of another shape.
+    """
+    if isinstance(shape, Surface):
+        return shape
+    if isinstance(shape, str | Path):
+        return read_surface(shape)
+    if isinstance(shape, tuple):
+        return Surface(shape[0], shape[1], name=f"The {name}")
+    return Surface(np.asarray(shape), name=f"The {name}")
+
+
+def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:
+    """Files by their stem.
+
+    Raises:
+        ConfigError: two of the same stem.
+    """
+    named = {path.stem: path for path in paths}
+    if len(named) < len(paths):
+        raise ConfigError("Two of the shapes to move along have the same name; rename one.")
+    return named
+
+
+def checked_landmarks(landmarks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corresponding (L, 3) points of source and target, as float64.
+
+    Raises:
+        DataError: other shapes, or of different numbers.
+    """
+    here, there = (np.asarray(x, dtype=np.float64) for x in landmarks)
+    if here.shape != there.shape or here.ndim != 2 or here.shape[1] != 3:
+        raise DataError(
+            f"The landmarks have shapes {here.shape} and {there.shape}; expected as many rows "
+            "of three coordinates on the source as on the target, in the same order."
+        )
+    return here, there
+
+
+def check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
+    """What to say of sizes that differ much.
+
+    Raises:
+        DataError: a shape is a single place, or sizes differ so much that units must.
+    """
+    sizes = [_size(source, "source"), _size(target, "target")]
+    ratio = max(sizes) / min(sizes)
+    larger, other = (source, target) if sizes[0] > sizes[1] else (target, source)
+    units = [text for factor, text in _UNITS.items() if 0.7 < ratio / factor < 1.4]
+    guess = (
+        f" Perhaps one is in {units[0].replace(' and ', ' and the other in ')}." if units else ""
+    )
+    if ratio > _LARGEST_RATIO:
+        raise DataError(
+            f"{larger.name} is {ratio:.3g} times larger than {other.name}; both must be in the "
+            f"same units and show the same object.{guess}"
+        )
+    if ratio > _UNUSUAL_RATIO and not partial:
+        return [f"{larger.name} is {ratio:.2g} times larger than {other.name}.{guess}"]
+    return []
+
+
+def _size(surface: Surface, what: str) -> float:
+    middle = surface.vertices.mean(axis=0)
+    size = float(np.linalg.norm(surface.vertices - middle, axis=1).mean())
+    if len(surface.vertices) == 1 or size <= 1e-12 * np.abs(middle).max():
+        raise DataError(
+            f"All points of {surface.name}, the {what}, coincide; expected the surface of an "
+            "object."
+        )
+    return size
+
+
+def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) -> SurfaceSamples:
+    """Points of a surface; all of a cloud that has fewer.
+
+    Raises:
+        ConfigError: fewer than 16 points are asked for.
+        DataError: there are fewer, or all lie on one line.
+    """
+    if points < FEWEST:
+        raise ConfigError(f"The number of points is {points}; expected at least {FEWEST}.")
+    count = points
+    if surface.faces is None:
+        count = min(points, len(np.unique(surface.vertices, axis=0)))
+        if count < FEWEST:
+            raise DataError(
+                f"{surface.name}, the {what}, has {count} distinct points; expected at least "
+                f"{FEWEST}."
+            )
+    extent = surface.vertices - surface.vertices.mean(axis=0)
+    widths = np.linalg.svd(extent, compute_uv=False)
+    if widths[1] <= 1e-6 * widths[0]:
+        raise DataError(
+            f"All points of {surface.name}, the {what}, lie on one line; expected the surface of "
+            "an object."
+        )
+    if surface.faces is not None:
+        return sample_surface(surface, count, rng)
+    if count == len(surface.vertices):
+        return _vertices(np.arange(count))
+    _, first = np.unique(surface.vertices, axis=0, return_index=True)
+    return _vertices(rng.permutation(first)[:count])
+
+
+def _vertices(index: np.ndarray) -> SurfaceSamples:
+    return SurfaceSamples(index[:, None].repeat(3, axis=1), np.tile([1.0, 0, 0], (len(index), 1)))
+
+
+def dense_points(surface: Surface) -> np.ndarray:
+    """Points to measure distances with: four times as many as the network sees."""
+    if surface.faces is None:
+        return surface.vertices
+    rng = np.random.default_rng(5)
+    return sample_surface(surface, 4 * POINTS, rng).places(surface.vertices)

@@ -1,0 +1,207 @@
+"""What travels together through a registration, and what it gives."""
+
+from __future__ import annotations
+
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dine.geometry.distance import distances
+from dine.geometry.interpolation import FittedDisplacement
+from dine.geometry.rigid import Alignment
+from dine.geometry.surface import Surface
+from dine.registration.calibration import Calibration
+from dine.registration.shapes import dense_points
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights with what belongs to them; see :func:`~dine.registration.model.load_model`."""
+
+    backbone: Any
+    weights: Path
+    facts: dict[str, Any]
+    prior: Any = None
+    prior_path: Path | None = None
+    calibration: Calibration | None = None
+
+    @property
+    def convention(self) -> str:
+        """The order of points that the prior was fitted in; ``none`` where it does not say."""
+        return str(self.prior.notes.get("convention", "none")) if self.prior else "none"
+
+    def calibration_for(self, settings: Settings) -> Calibration | None:
+        """The calibration where it applies: to whole targets, and its own rounds of refinement."""
+        if self.calibration is None or settings.partial:
+            return None
+        return self.calibration if settings.rounds == self.calibration.facts.get("rounds") else None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to register; as for :func:`~dine.registration.register.register`."""
+
+    prealign: str | np.ndarray
+    rounds: int
+    partial: bool
+    points: int
+    seed: int
+    device: torch.device
+
+    def described(self, points: int) -> dict[str, Any]:
+        """For the report; ``points`` were drawn."""
+        return {
+            "rounds": self.rounds,
+            "partial": self.partial,
+            "points": points,
+            "seed": self.seed,
+            "prealign": self.prealign if isinstance(self.prealign, str) else "given",
+            "device": str(self.device),
+        }
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Points of both scans, in the normalised frame of the aligned source.
+
+    Attributes:
+        source: as given.
+        target: as given.
+        alignment: between the source's coordinates, the target's and the frame.
+        places: (N, 3) points drawn on the source, in its coordinates.
+        start: (N, 3) the same in the frame.
+        goal: (M, 3) points drawn on the target, in the frame.
+    """
+
+    source: Surface
+    target: Surface
+    alignment: Alignment
+    places: np.ndarray
+    start: np.ndarray
+    goal: np.ndarray
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """Where points of the source belong, in the normalised frame.
+
+    Attributes:
+        start: (N, 3) points of the source.
+        goal: (M, 3) points of the target.
+        field: (N, 3) displacement from ``start``.
+        indicator: (N,) what tells its errors apart, which a calibration translates; None where
+            nothing does.
+        supported: (N,) bool, points that the target shows.
+        inconsistency: mean distance from ``start`` of points registered to the target and back;
+            None where that was not tried.
+    """
+
+    start: np.ndarray
+    goal: np.ndarray
+    field: np.ndarray
+    indicator: np.ndarray | None
+    supported: np.ndarray
+    inconsistency: float | None = None
+
+    @property
+    def moved(self) -> np.ndarray:
+        """(N, 3) where the points belong."""
+        return self.start + self.field
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Moves any points of the source's coordinates to where they belong, in the target's."""
+
+    alignment: Alignment
+    field: FittedDisplacement
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """(V, 3) points, moved."""
+        places = self.alignment.normalise(points)
+        return self.alignment.restore(places + self.field(places))
+
+    def surface(self, surface: Surface) -> Surface:
+        """A surface with its vertices moved."""
+        return Surface(self(surface.vertices), surface.faces, name=surface.name)
+
+
+@dataclass(frozen=True)
+class ExpectedError:
+    """Expected distance from the true place, in the units of the source.
+
+    Attributes:
+        vertices: (V,) of all vertices.
+        points: (N,) of the drawn points.
+    """
+
+    vertices: np.ndarray
+    points: np.ndarray
+
+    @property
+    def mean(self) -> float:
+        """Over the surface."""
+        return float(self.points.mean())
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What the report says about a result.
+
+    Attributes:
+        verdict: ``plausible``, ``doubtful`` (unlike the validation pairs in some way, or a
+            result that a check speaks against) or ``implausible`` (folded, or far outside what the
+            training fields look like).
+        reasons: plain sentences, empty where there is nothing to say.
+        percentiles: of this result among the validation pairs, by name, 0 to 100.
+        expected_error: mean over the surface, in the units of the source; None without calibration.
+    """
+
+    verdict: str
+    reasons: tuple[str, ...]
+    percentiles: dict[str, float]
+    expected_error: float | None
+
+
+@dataclass(frozen=True)
+class RegistrationResult:
+    """A source moved onto a target. All lengths are in the units of the source.
+
+    Attributes:
+        source: as given.
+        target: as given.
+        moved: the source with its vertices moved, same order and faces.
+        displacement: (V, 3) moved minus source vertices; includes the rigid alignment.
+        uncertainty: (V,) expected distance from the true place, or None without calibration.
+        applied: moved further points or surfaces, by name.
+        points: (n, 3) sampled source points that the network saw, where they are in the source.
+        point_displacement: (n, 3) of these.
+        point_uncertainty: (n,) of these, or None.
+        supported: (n,) bool, points that the target shows; all, unless ``partial``.
+        trust: how far to trust the result.
+        report: everything that the JSON report says.
+        alignment: of the source to the target, and the normalised frame there.
+    """
+
+    source: Surface
+    target: Surface
+    moved: Surface
+    displacement: np.ndarray
+    uncertainty: np.ndarray | None
+    applied: dict[str, Surface]
+    points: np.ndarray
+    point_displacement: np.ndarray
+    point_uncertainty: np.ndarray | None
+    supported: np.ndarray
+    trust: Trust
+    report: dict[str, Any] = field(default_factory=dict)
+    _: KW_ONLY
+    alignment: Alignment
+
+    @property
+    def distance_to_target(self) -> np.ndarray:
+        """(V,) distance of every moved vertex to the nearest sampled place of the target."""
+        return distances(self.moved.vertices, dense_points(self.target))
