@@ -106,7 +106,9 @@ def summary(found: list[tuple[dict[str, str], pd.DataFrame, pd.DataFrame]]) -> N
             display_name(place[2]),
         ]
         print(f"| {' | '.join([*names, *cells])} |")
-    print("\nMean Chamfer distance ×1e-4 over all levels and runs; in brackets those of single runs.")
+    print(
+        "\nMean Chamfer distance ×1e-4 over all levels and runs; in brackets those of single runs."
+    )
     print("Against the control: lower or higher in every run, or else undecided.\n")
 
 
