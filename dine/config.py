@@ -140,7 +140,7 @@ class Pairs(Section):
     points: Annotated[Count, Field(ge=16)] = 1024
     """Points per cloud."""
     convention: Literal["sphere", "disc", "lexicographic", "none"] = "sphere"
-    """What index i means across objects; see docs/pairs.md."""
+    """What index i means across objects; see docs/reference/pairs.md."""
     split: Split = Split()
 
 
@@ -365,7 +365,7 @@ class Evaluation(Section):
     training_spread: Fraction = 0.12
     """How much the difference between two methods varies from one training to another (another
     seed, or another CPU's rounding): a standard deviation, as a share of the reference's mean.
-    Intervals hold it; docs/results.md says how it was measured."""
+    Intervals hold it; docs/results/default-run.md says how it was measured."""
 
 
 class Pretraining(Training):
@@ -510,7 +510,7 @@ class PriorRequest(Request):
 
 
 class Resources(Section):
-    """What each kind of job asks a cluster for; without one it has no effect (docs/cluster.md)."""
+    """What each kind of job asks a cluster for; else without effect (docs/guide/cluster.md)."""
 
     data: Request = Request()
     """Raw meshes, pairs, corrupted and resampled targets."""

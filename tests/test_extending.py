@@ -1,4 +1,4 @@
-"""The examples of docs/extending.md, through the machinery that the built-in classes go through."""
+"""The examples of docs/guide/extending.md, treated as the built-in classes are."""
 
 import json
 import os

@@ -2,7 +2,8 @@
 
 Every method is a class in :data:`CLASSICAL`; its arguments are those of the method, its call turns
 (N, 3) source and (M, 3) target points of the normalised frame into a displacement field. The
-defaults are the best settings found on validation pairs; docs/classical.md has the whole sweep.
+defaults are the best settings found on validation pairs; docs/reference/classical.md has the whole
+sweep.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from dine.registry import Registry
 # error among the ones that allow for outliers, on 30 synthetic validation pairs (16 in the manner
 # of SynBench, 14 of DeformedTissue): 0.016 and 0.026; unregistered 0.165. Targets held the same
 # points as the sources, shuffled. With points of their own (60 pairs) it is 0.081 and 0.080;
-# unregistered 0.161. docs/classical.md has the sweep.
+# unregistered 0.161. docs/reference/classical.md has the sweep.
 
 
 class Classical(ABC):

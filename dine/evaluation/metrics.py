@@ -62,7 +62,7 @@ def evaluate(
 ) -> None:
     """Write one row per method, predicted test pair and condition, and the per-point errors.
 
-    ``out`` (CSV) has the columns that docs/metrics.md defines. Distances are to the clean target in
+    ``out`` (CSV) has the columns of docs/reference/metrics.md. Distances are to the clean target in
     the normalised frame and not squared, but for ``cd``, ``cd_observed`` (to the target that the
     model saw) and ``cd_unregistered`` (of the source as it is), which are symmetric squared Chamfer
     distances, and for ``mce_original``, which is in the units of the files. ``seconds`` is empty

@@ -1,6 +1,6 @@
 """How close to the truth a moved source is; what is lost and what is accurate.
 
-Definitions, units and sources of all of them: docs/metrics.md.
+Definitions, units and sources of all of them: docs/reference/metrics.md.
 """
 
 from __future__ import annotations

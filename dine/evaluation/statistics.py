@@ -2,7 +2,7 @@
 
 All functions take the rows of one or more ``metrics.csv`` in one frame. Values are averaged over
 training seeds first, so that a pair counts once however often a method was trained; what the seeds
-differ by is reported beside. Definitions and sources: docs/metrics.md.
+differ by is reported beside. Definitions and sources: docs/reference/metrics.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Distances between clouds, and of corresponding points.
 
-Definitions, units and sources of all of them: docs/metrics.md.
+Definitions, units and sources of all of them: docs/reference/metrics.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Whether a displacement field is one of tissue: what it turns inside out, and its local strain.
 
-Definitions, units and sources of all of them: docs/metrics.md.
+Definitions, units and sources of all of them: docs/reference/metrics.md.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def read_jobs(path: Path) -> list[Job]:
     """The pairs of a manifest, or those found in a folder.
 
     A manifest is a CSV file with the columns ``source`` and ``target``, paths relative to it, and
-    perhaps ``name``. A folder is read as the pairs step reads one (docs/data-sources.md).
+    perhaps ``name``. A folder is read as the pairs step reads one (docs/guide/data-sources.md).
 
     Raises:
         DataError: missing, unreadable, without pairs, or names that are not unique.

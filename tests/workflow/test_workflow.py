@@ -385,7 +385,7 @@ def commands(page):
 
 
 def test_from_meshes_of_ones_own_to_a_registration(tmp_path, monkeypatch):
-    """The commands of docs/own-organ.md, in a smaller configuration."""
+    """The commands of docs/guide/own-organ.md, in a smaller configuration."""
     folder = copy_workflow(tmp_path)
     monkeypatch.chdir(folder)
     organs = folder / "organs"

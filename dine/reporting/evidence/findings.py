@@ -15,7 +15,7 @@ from dine.reporting.evidence.wording import VALUES, are, count_of, join, signed
 from dine.reporting.tables import display_name
 
 FEW_OBJECTS = 20
-"""Below this many objects bootstrap intervals are clearly too narrow, see docs/metrics.md."""
+"""Below this many objects bootstrap intervals are too narrow, see docs/reference/metrics.md."""
 
 
 @dataclass(frozen=True)
