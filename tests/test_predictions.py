@@ -19,7 +19,7 @@ from dine.files import read_json
 from dine.priors import PRIORS
 from dine.registration.classical_predictions import classical_predictions
 from dine.registration.predictions import refine_predictions
-from dine.reporting.evidence.examples import typical
+from dine.reporting.examples import typical
 
 pytestmark = pytest.mark.numerical
 

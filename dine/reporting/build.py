@@ -14,7 +14,8 @@ from dine.data.pairs import read_pairs
 from dine.files import read_json
 from dine.priors import PCAPrior, load_prior
 from dine.reporting import figures as draw
-from dine.reporting.tables import display_name, load_metrics, origin_of
+from dine.reporting.loading import load_metrics, origin_of
+from dine.reporting.names import display_name
 from dine.results import CLEAN, Results, figure_names, own_searches, pca_priors, runs, strengths
 
 HISTORY_WINDOW = 20
@@ -103,7 +104,9 @@ class Run:
         return {"lambda": self.files.search, **own}
 
     def search(self, path: Path) -> Figure:
-        return draw.lambda_figure(read_json(path), self.origin(self.config.lambda_search.dataset))
+        search = read_json(path)
+        where = self._title(search["dataset"], search["backbone"])
+        return draw.search_figure([search], where, self.origin(search["dataset"]))
 
     def _pca(self, dataset: str, backbone: str, name: str) -> PCAPrior:
         return load_prior(self.files.prior(dataset, backbone, name))
