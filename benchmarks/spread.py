@@ -19,7 +19,8 @@ import pandas as pd
 from dine import config as dine_config
 from dine.files import read_json
 from dine.reporting.effects import effects
-from dine.reporting.tables import OBJECTS_NAMES, display_name, load_metrics
+from dine.reporting.loading import load_metrics
+from dine.reporting.names import OBJECTS, display_name
 from dine.results import CLEAN, Results, runs, trained_on
 
 KEYS = ["objects", "dataset", "backbone", "method"]
@@ -65,7 +66,7 @@ def main(folders: list[Path]) -> int:
             rows = [table.loc[place] for table in tables if place in table.index]
             spreads.append(np.std([row["relative"] for row in rows], ddof=1))
             cells = [
-                OBJECTS_NAMES[place[0]],
+                OBJECTS[place[0]],
                 display_name(trained_on(place[1])),
                 *map(display_name, place[2:]),
                 *(f"{signed(row['relative'])} %{MARKS[row['verdict']]}" for row in rows),

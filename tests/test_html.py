@@ -117,7 +117,7 @@ def full_page(tmp_path, figure, metrics):
             [
                 html.as_yaml(config),
                 html.grid(["Package", "Version"], {"dine": "0.1.0"}.items()),
-                html.Links({"Table 1": "tables/table1.csv"}),
+                html.Part("links", {"Table 1": "tables/table1.csv"}),
             ],
         ),
     ]
@@ -290,7 +290,7 @@ def test_the_page_shows_effects_their_chance_and_where_they_were_made(tmp_path):
 
 @pytest.mark.parametrize("address", ["https://example.org/x.csv", "//example.org", "/etc/x"])
 def test_links_must_be_relative(tmp_path, address):
-    links = html.Section("files", "Files", [html.Links({"x": address})])
+    links = html.Section("files", "Files", [html.Part("links", {"x": address})])
     with pytest.raises(DataError, match="only by a relative path"):
         page(tmp_path, made_up(0.25), more=[links])
     assert not (tmp_path / "report.html").exists()

@@ -35,20 +35,11 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Heading:
-    text: str
+class Part:
+    """A ``heading``, ``code``, or ``links``: addresses relative to the page by label."""
 
-
-@dataclass(frozen=True)
-class Code:
-    text: str
-
-
-@dataclass(frozen=True)
-class Links:
-    """Addresses relative to the page by label."""
-
-    addresses: Mapping[str, str]
+    kind: str
+    content: Any
 
 
 @dataclass(frozen=True)
@@ -66,7 +57,7 @@ class Folded:
     items: Sequence[Item | None]
 
 
-Item = str | list | dict | Table | Picture | Heading | Code | Links | Beside | Folded
+Item = str | list | dict | Table | Picture | Part | Beside | Folded
 """A string is a paragraph, a list are its points, and a dictionary explains its keys."""
 
 
@@ -137,9 +128,9 @@ def grid(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table | None:
     return Table("", "", "", columns, cells, pd.DataFrame()) if cells else None
 
 
-def as_yaml(config: Mapping[str, Any] | None) -> Code | None:
-    """The configuration as it is shown, None where there is none."""
-    return None if config is None else Code(yaml.safe_dump(dict(config), sort_keys=False))
+def as_yaml(config: Mapping[str, Any]) -> Part:
+    """The configuration as it is shown."""
+    return Part("code", yaml.safe_dump(dict(config), sort_keys=False))
 
 
 def _all_shown(items: Sequence[Item | None]) -> list[dict[str, Any]]:
@@ -154,13 +145,16 @@ def _shown(item: Item) -> dict[str, Any]:
         return {"kind": kind, "title": title, "parts": _all_shown(item.items)}
     if isinstance(item, Picture):
         return {"kind": kind, "caption": item.caption, **_embedded(Path(item.png))}
-    if isinstance(item, Links):
-        for label, address in item.addresses.items():
-            if "://" in address or address.startswith("/"):
-                raise DataError(
-                    f"The report can link {label} only by a relative path, not {address}."
-                )
+    if isinstance(item, Part):
+        return _checked(item)
     return {"kind": kind, "content": item}
+
+
+def _checked(part: Part) -> dict[str, Any]:
+    for label, address in part.content.items() if part.kind == "links" else ():
+        if "://" in address or address.startswith("/"):
+            raise DataError(f"The report can link {label} only by a relative path, not {address}.")
+    return vars(part)
 
 
 def _embedded(png: Path) -> dict[str, Any]:

@@ -102,6 +102,10 @@ def signed(value: float, decimals: int) -> str:
     return DASH if pd.isna(value) else minus(f"{value:+.{decimals}f}")
 
 
+def percent(value: float, decimals: int) -> str:
+    return DASH if pd.isna(value) else f"{signed(value, decimals)} %"
+
+
 def short(value: object) -> str:
     """A number with four digits that count, a name, or a dash for nothing."""
     if isinstance(value, str):

@@ -16,9 +16,8 @@ from dine.reporting.build import Run
 from dine.reporting.effects import headlines, overview
 from dine.reporting.html import (
     Beside,
-    Heading,
     Item,
-    Links,
+    Part,
     Picture,
     Section,
     as_yaml,
@@ -100,7 +99,7 @@ def result_sections(
                 beside.setdefault(table, []).append(picture)
             else:
                 apart.append(picture)
-        figures += [Heading(heading), *apart] if apart else []
+        figures += [Part("heading", heading), *apart] if apart else []
     tables = [Beside([table, *beside.get(table.name, [])]) for table in all_tables(metrics, spread)]
     findings = [headlines(metrics, spread=spread), overview(metrics, spread=spread)]
     return [
@@ -160,14 +159,14 @@ def _made(run: Run, config: Config) -> list[Item | None]:
         links[f"{display_name(dataset)}: pairs"] = f"{dataset}/pairs.h5"
     return [
         grid(["What", "Value"], made.items()),
-        Heading("Time per step"),
+        Part("heading", "Time per step"),
         grid(["Step", "Time"], seconds.items()),
-        Heading("Versions"),
+        Part("heading", "Versions"),
         grid(["Package", "Version"], versions().items()),
-        Heading("Configuration"),
+        Part("heading", "Configuration"),
         as_yaml(config.model_dump(mode="json")),
-        Heading("Files"),
-        Links(links),
+        Part("heading", "Files"),
+        Part("links", links),
     ]
 
 

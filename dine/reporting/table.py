@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,20 +22,18 @@ class Cell:
     bold: bool = False
 
 
-@dataclass(frozen=True)
-class Column:
-    """How a column shows a record; adjacent columns of one group share a heading."""
+Columns = dict[tuple[str, str], Iterable[Any]]
+"""What the rows show in each column, by (group, label): text, numbers or cells.
 
-    label: str
-    show: Callable[[Mapping[str, Any]], str | Cell]
-    group: str = ""
+Adjacent columns of one group share a heading; the group of a row-label column is empty.
+"""
 
 
 @dataclass(frozen=True)
 class Table:
     """A table to read (``header``, ``rows``) and the tidy numbers behind it (``data``).
 
-    ``header`` holds (group, label) per column; the group of a row-label column is empty.
+    ``header`` holds (group, label) per column, as in ``Columns``.
     """
 
     name: str
@@ -57,15 +55,10 @@ class Table:
         return found
 
 
-def laid_out(records: Iterable[Mapping[str, Any]], columns: Sequence[Column]) -> dict[str, tuple]:
-    """``header`` and ``rows`` of a table with a row for each record."""
-    shown = (tuple(column.show(record) for column in columns) for record in records)
-    return {
-        "header": tuple((column.group, column.label) for column in columns),
-        "rows": tuple(
-            tuple(x if isinstance(x, Cell) else Cell(str(x)) for x in cells) for cells in shown
-        ),
-    }
+def laid_out(columns: Columns) -> dict[str, tuple]:
+    """``header`` and ``rows`` of a table."""
+    cells = [[x if isinstance(x, Cell) else Cell(str(x)) for x in c] for c in columns.values()]
+    return {"header": tuple(columns), "rows": tuple(zip(*cells, strict=True))}
 
 
 def write_tables(tables: Sequence[Table], folder: Path) -> None:

@@ -19,7 +19,7 @@ from dine.evaluation.statistics import verdicts
 from dine.reporting import names
 from dine.reporting.loading import origin_of, rounded
 from dine.reporting.names import CD_SCALE, DASH, display_name, mean_and_deviation, rank
-from dine.reporting.table import Cell, Column, Table, laid_out
+from dine.reporting.table import Cell, Columns, Table, laid_out
 from dine.results import CLEAN, PAPER_TABLES, table_name, trained_on
 
 CORRUPTIONS = ("outliers", "noise", "resampled")
@@ -270,20 +270,31 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
     """What does the prior add over longer training? The rows of ``gains`` for one dataset."""
     data = gains(metrics[metrics["dataset"] == dataset], spread)
     data.insert(1, "origin", origin_of(dataset, metrics) or "")
-    reduction = "Reduction of the mean CD"
     chance = f", and of the training, from run to run ± {100 * spread:g} % (standard deviation)"
-    columns = [
-        Column("Backbone", lambda row: display_name(row["backbone"])),
-        Column("Prior", lambda row: display_name(row["method"])),
-        Column("Setting", lambda row: _setting_label(row)[0]),
-        Column("Level", lambda row: _setting_label(row)[1]),
-        Column("Pairs", lambda row: str(row["n"])),
-        Column("Control over Stage 1", _percent("lambda0_gain_over_stage1"), reduction),
-        Column("Prior over Stage 1", _percent("gain_over_stage1"), reduction),
-        Column("Prior over control", _percent("gain_over_lambda0"), reduction),
-        Column("95 % interval", _interval, reduction),
-        Column("Verdict", lambda row: DASH if pd.isna(row["verdict"]) else row["verdict"]),
-        Column("Pairs better than control", _better),
+    rows = data.to_dict("records")
+    settings = [_setting_label(row) for row in rows]
+    columns: Columns = {
+        ("", "Backbone"): data["backbone"].map(display_name),
+        ("", "Prior"): data["method"].map(display_name),
+        ("", "Setting"): [setting for setting, _ in settings],
+        ("", "Level"): [level for _, level in settings],
+        ("", "Pairs"): data["n"],
+    }
+    reduction = "Reduction of the mean CD"
+    for label, name in (
+        ("Control over Stage 1", "lambda0_gain_over_stage1"),
+        ("Prior over Stage 1", "gain_over_stage1"),
+        ("Prior over control", "gain_over_lambda0"),
+    ):
+        columns[reduction, label] = [names.percent(value, 1) for value in data[name]]
+    columns[reduction, "95 % interval"] = [
+        DASH if np.isnan(row["low"]) else f"{names.interval(row['low'], row['high'])} %"
+        for row in rows
+    ]
+    columns["", "Verdict"] = data["verdict"].fillna(DASH)
+    better = data["pairs_better_than_lambda0"]
+    columns["", "Pairs better than control"] = [
+        DASH if np.isnan(value) else f"{value:.0f} %" for value in better
     ]
     return Table(
         name=f"gains_{dataset}",
@@ -293,7 +304,7 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
         "losses. The control differs from the prior only in λ = 0. The interval is that of the "
         "reduction over the control: of the test pairs, drawn by deformation where the object is "
         f"known and by object otherwise{chance if spread else ''}. Undecided: it holds zero.",
-        **laid_out(data.to_dict("records"), columns),
+        **laid_out(columns),
         data=data.rename(
             columns={name: f"{name}_1e-4" for name in data if name.endswith("mean")}
             | {
@@ -396,19 +407,3 @@ def _count(values: pd.DataFrame) -> str:
         return DASH
     low, high = counts.min(), counts.max()
     return f"{low}" if low == high else f"{low}{DASH}{high}"
-
-
-def _percent(name: str):
-    def show(row: Mapping[str, Any]) -> str:
-        return DASH if np.isnan(row[name]) else f"{names.signed(row[name], 1)} %"
-
-    return show
-
-
-def _interval(row: Mapping[str, Any]) -> str:
-    return DASH if np.isnan(row["low"]) else f"{names.interval(row['low'], row['high'])} %"
-
-
-def _better(row: Mapping[str, Any]) -> str:
-    better = row["pairs_better_than_lambda0"]
-    return DASH if np.isnan(better) else f"{better:.0f} %"

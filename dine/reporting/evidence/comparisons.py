@@ -221,46 +221,33 @@ class Evidence:
         keys = [*_PLACE, "method"]
         some = pd.concat([at(self.cells, place) for place in self.judged])
         some = some[(some["level"] >= LARGE) & some["method"].isin(self.rivals)]
-        some = some.assign(
-            lower=some["verdict"] == "lower",
-            higher=some["verdict"] == "higher",
-            below=some["difference"] < 0,
-        )
-        wide = some.pivot(
-            index=[*keys, "level"], columns="value", values=["lower", "higher", "below"]
-        )
-        columns = pd.MultiIndex.from_product([["lower", "higher", "below"], ["mce", "cd"]])
-        wide = wide.reindex(columns=columns).eq(True)
+        lower = some["verdict"] == "lower"
+        by_value = {value: lower & (some["value"] == value) for value in ("mce", "cd")}
+        some = some.assign(**by_value, below=some["difference"] < 0)
+        levels = some.assign(worse=some["verdict"] == "higher").groupby([*keys, "level"])
+        counts = levels[["mce", "cd", "worse"]].any()
+        counts.insert(0, "both", counts["mce"] & counts["cd"])
+        counts.insert(1, "both_lower", levels["below"].sum() == 2)
+        counts = counts.groupby(level=keys).sum().reset_index()
         means = self.by_level
-        large = means[(means["method"] == self.reference) & (means["level"] >= LARGE)]
-        counts = {
-            "both": wide["lower"].all(axis=1),
-            "both_lower": wide["below"].all(axis=1),
-            "mce": wide["lower", "mce"],
-            "cd": wide["lower", "cd"],
-            "worse": wide["higher"].any(axis=1),
-        }
-        counted = pd.DataFrame(counts).groupby(level=keys).sum().reset_index()
-        counted.insert(
-            3, "levels", counted.set_index(_PLACE).index.map(large.groupby(_PLACE).size())
-        )
-        counted = counted.merge(self._against_classical(), on=keys, how="left")
-        ordered = self._in_order(counted, "method")
+        reference = means[(means["method"] == self.reference) & (means["level"] >= LARGE)]
+        every = reference.groupby(_PLACE).size().rename("levels").reset_index()
+        counts = counts.merge(every, on=_PLACE).merge(self._below_classical(), on=keys, how="left")
+        counts.insert(3, "levels", counts.pop("levels"))
+        ordered = self._in_order(counts, "method")
         return pd.concat([at(ordered, place) for place in self.judged], ignore_index=True)
 
-    def _against_classical(self) -> pd.DataFrame:
+    def _below_classical(self) -> pd.DataFrame:
         means = self.by_level[~self.by_level["partial"]]
-        keys = [*_PLACE, "level"]
-        values = ["mce_mean", "cd_mean"]
+        keys, values = [*_PLACE, "level"], ["mce_mean", "cd_mean"]
         best = means[means["method"].isin(self.classical)].groupby(keys)[values].min()
-        both = means[means["method"].isin(self.candidates)].merge(
-            best.reset_index(), on=keys, suffixes=("", "_best")
-        )
-        counts = {"classical_levels": both["mce_mean_best"].notna() | both["cd_mean_best"].notna()}
+        ours = means[means["method"].isin(self.candidates)]
+        both = ours.merge(best.reset_index(), on=keys, suffixes=("", "_best"))
+        found = both[[*_PLACE, "method"]].assign(classical_levels=1)
         for value in ("mce", "cd"):
             below = both[f"{value}_mean"] < both[f"{value}_mean_best"]
-            counts[f"below_classical_{value}"] = below
-        return both[[*_PLACE, "method"]].assign(**counts).groupby([*_PLACE, "method"]).sum()
+            found[f"below_classical_{value}"] = below.astype(int)
+        return found.groupby([*_PLACE, "method"]).sum().reset_index()
 
     # ---- means
 

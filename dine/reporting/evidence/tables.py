@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pandas as pd
 from dine.data.pairs import RESAMPLED
 from dine.evaluation.statistics import NO_BACKBONE
 from dine.reporting import names
-from dine.reporting.effects import training_chance, verdict_cell
+from dine.reporting.effects import verdict_cell
 from dine.reporting.evidence.comparisons import LARGE, Evidence, at
 from dine.reporting.names import (
     DASH,
@@ -27,11 +26,13 @@ from dine.reporting.names import (
     signed,
     slug,
 )
-from dine.reporting.table import Cell, Column, Table, laid_out
+from dine.reporting.table import Cell, Columns, Table, laid_out
 from dine.results import CLEAN
 
 LOWER, HIGHER = MARKS["lower"], MARKS["higher"]
+GOAL_CELLS = f"Levels with both {LOWER} / any {HIGHER}"
 Place = tuple[str, str]
+Row = Mapping[str, Any]
 _DIAGNOSED = {
     "dataset": "Dataset",
     "backbone": "Backbone",
@@ -46,29 +47,26 @@ _DIAGNOSED = {
 }
 
 
-def _methods(evidence: Evidence) -> list[Column]:
+def _methods(evidence: Evidence, methods: Iterable[str]) -> Columns:
     """The first columns: what kind of method, and which."""
-
-    def title(row: Mapping[str, Any]) -> str:
-        reference = " (reference)" if row["method"] == evidence.reference else ""
-        return evidence.title(row["method"]) + reference
-
-    return [
-        Column("Kind", lambda row: evidence.methods[row["method"]].kind),
-        Column("Method", title),
-    ]
+    methods = list(methods)
+    reference = {evidence.reference: " (reference)"}
+    return {
+        ("", "Kind"): [evidence.methods[name].kind for name in methods],
+        ("", "Method"): [evidence.title(name) + reference.get(name, "") for name in methods],
+    }
 
 
-def _shows(name: str, decimals: int, scale: float = 1.0) -> Callable[[Mapping[str, Any]], str]:
-    return lambda row: number(row[name], decimals, scale)
-
-
-def _all_data(evidence: Evidence) -> str:
-    return join([evidence.where(dataset) for dataset in evidence.datasets])
+def _all_data(evidence: Evidence, datasets: Iterable[str] | None = None) -> str:
+    return join([evidence.where(name) for name in datasets or evidence.datasets])
 
 
 def _short_place(place: Place) -> str:
     return ", ".join(display_name(x) for x in place if x != NO_BACKBONE)
+
+
+def _marked(text: str, verdict: Any) -> str:
+    return f"{text} {MARKS.get(verdict, '')}".strip()
 
 
 # --------------------------------------------------------------------------------- in short
@@ -78,21 +76,21 @@ def basis_table(evidence: Evidence) -> Table:
     """What everything rests on: the test pairs and trainings of each dataset."""
     networks = evidence.clean[evidence.clean["backbone"] != NO_BACKBONE]
     seeds = networks.groupby(["dataset", "backbone", "method"])["seed"].nunique()
-    grouped = evidence.clean.groupby("dataset")
-    data = grouped[["pair", "object", "level"]].nunique().reindex(evidence.datasets)
+    data = evidence.clean.groupby("dataset")[["pair", "object", "level"]].nunique()
     data["fewest_seeds"] = seeds.groupby("dataset").min()
     data["most_seeds"] = seeds.groupby("dataset").max()
-    data["counts"] = [name in dict(evidence.judged) for name in data.index]
-    columns = [
-        Column("Dataset", lambda row: evidence.where(row["dataset"])),
-        Column("Test pairs", lambda row: row["pair"]),
-        Column("Objects", lambda row: row["object"]),
-        Column("Levels", lambda row: row["level"]),
-        Column("Seeds, fewest", _shows("fewest_seeds", 0), "Trainings of a network"),
-        Column("Seeds, most", _shows("most_seeds", 0), "Trainings of a network"),
-        Column("Counts for the goal", lambda row: "yes" if row["counts"] else "no"),
-    ]
-    data = data.reset_index()
+    data = data.reindex(evidence.datasets)
+    judged = dict(evidence.judged)
+    seeds = "Trainings of a network"
+    columns = {
+        ("", "Dataset"): [evidence.where(name) for name in data.index],
+        ("", "Test pairs"): data["pair"],
+        ("", "Objects"): data["object"],
+        ("", "Levels"): data["level"],
+        (seeds, "Seeds, fewest"): [number(x, 0) for x in data["fewest_seeds"]],
+        (seeds, "Seeds, most"): [number(x, 0) for x in data["most_seeds"]],
+        ("", "Counts for the goal"): ["yes" if name in judged else "no" for name in data.index],
+    }
     caption = (
         f"{_all_data(evidence)}. The same test pairs for all methods, averaged over seeds; "
         "differences are between trainings of the same seeds."
@@ -103,48 +101,35 @@ def basis_table(evidence: Evidence) -> Table:
             f" {'; '.join(aside)}: shown, but with few methods or pairs, so no part of the goal "
             "or of the order of methods."
         )
-    layout = laid_out(data.to_dict("records"), columns)
-    return Table("basis", "What this rests on", caption, **layout, data=data)
+    title = "What this rests on"
+    return Table("basis", title, caption, **laid_out(columns), data=data.reset_index())
 
 
 def verdict_table(evidence: Evidence, place: Place) -> Table:
     """Lower, higher or undecided: every method against the reference at a place."""
-    levels = at(evidence.cells, place).groupby(["value", "method"])["verdict"].agg(list).to_dict()
-    tables = [evidence.overall(place, condition) for condition in (CLEAN, RESAMPLED)]
-    data = pd.concat(tables, ignore_index=True)
+    data = pd.concat([evidence.overall(place, condition) for condition in (CLEAN, RESAMPLED)])
     data = data[data["method"].isin(evidence.rivals)]
-    keys = ["condition", "value", "method"]
-    found = {tuple(row[key] for key in keys): row for row in data.to_dict("records")}
-
-    def tally(row: Mapping[str, Any], value: str) -> str:
-        here = levels.get((value, row["method"]), [])
-        return f"{here.count('lower')} / {here.count('higher')} of {len(here)}"
-
-    columns = _methods(evidence)
+    methods = list(dict.fromkeys(data["method"]))
+    found = data.set_index(["value", "condition", "method"]).to_dict("index")
+    levels = at(evidence.cells, place).groupby(["value", "method"])["verdict"].agg(list).to_dict()
+    columns = _methods(evidence, methods)
     for value, (long, _, _, _) in VALUES.items():
         for condition in dict.fromkeys(data["condition"]):
-            columns.append(
-                Column(
-                    "Clean targets" if condition == CLEAN else names.CONDITIONS[condition],
-                    lambda row, setting=(condition, value): verdict_cell(
-                        found.get((*setting, row["method"])), "decided"
-                    ),
-                    long,
-                )
-            )
-        columns.append(Column(f"Levels {LOWER} / {HIGHER}", partial(tally, value=value), long))
-    records = [{"method": m} for m in evidence.rivals if m in set(data["method"])]
-    reference = evidence.title(evidence.reference)
+            label = "Clean targets" if condition == CLEAN else names.CONDITIONS[condition]
+            rows = [found.get((value, condition, name)) for name in methods]
+            columns[long, label] = [verdict_cell(row, "decided") for row in rows]
+        tallies = [levels.get((value, name), []) for name in methods]
+        columns[long, f"Levels {LOWER} / {HIGHER}"] = [
+            f"{x.count('lower')} / {x.count('higher')} of {len(x)}" for x in tallies
+        ]
+    reference, where = evidence.title(evidence.reference), evidence.where(*place)
     return Table(
         f"verdicts_{slug(*place)}",
-        f"Lower or higher than {reference}? {evidence.where(*place)}",
-        f"{evidence.where(*place)}. Difference of the mean over all levels to {reference}, in "
-        "percent of it, with its 95 % interval, of the pairs, drawn by object."
-        + (training_chance(evidence.spread) if evidence.spread else "")
-        + " Lower (bold) or higher: the interval holds no zero. Otherwise it is undecided. "
-        f"{LOWER} / {HIGHER}: levels of clean targets with a significantly lower and higher mean "
-        "(p < 0.05 after Holm).",
-        **laid_out(records, columns),
+        f"Lower or higher than {reference}? {where}",
+        f"{where}. Difference of the mean over all levels to {reference}, in percent of it, with "
+        f"its 95 % interval. Bold: lower. {LOWER} / {HIGHER}: levels of clean targets with a "
+        "significantly lower and higher mean.",
+        **laid_out(columns),
         data=data,
     )
 
@@ -154,46 +139,28 @@ def goal_table(evidence: Evidence) -> Table | None:
     goal = evidence.goal
     if goal.empty:
         return None
-    every = [evidence.reference, *evidence.rivals]
-    order = {value: evidence.ranking(every, value) for value in VALUES}
+    methods = [evidence.reference, *evidence.rivals]
     needed = int(goal.groupby(["dataset", "backbone"])["levels"].max().sum())
-    found = {(*row[:2], row[2]): row for row in goal.itertuples(index=False)}
-    total = goal.groupby("method").sum(numeric_only=True)
-
-    def mean(row: Mapping[str, Any], value: str) -> Cell:
-        _, _, scale, decimals = VALUES[value]
-        means = order[value]
-        if row["method"] not in means:
-            return Cell(DASH)
-        text = number(means[row["method"]], decimals, scale)
-        if row["method"] != evidence.reference and evidence.reference in means:
-            change = means[row["method"]] / means[evidence.reference] - 1
-            text += f" ({signed(100 * change, 1)} %)"
-        return Cell(text, row["method"] == means.index[0])
-
-    def of_classical(row: Mapping[str, Any], value: str) -> str:
-        levels = row["classical_levels"]
-        return f"{row[f'below_classical_{value}']:g} of {levels:g}" if levels > 0 else DASH
-
-    def of_place(row: Mapping[str, Any], place: Place) -> str:
-        cell = found.get((*place, row["method"]))
-        return f"{cell.mce} · {cell.cd} · {cell.both} / {cell.worse}" if cell else DASH
-
-    columns = _methods(evidence)
-    group = f"Mean, levels from {LARGE:g} on"
-    columns += [Column(VALUES[v][0], partial(mean, value=v), group) for v in VALUES]
-    columns += [
-        Column("Reached", lambda row: Cell(f"{row['both']:g} of {needed}", row["both"] == needed)),
-        Column("Evaluated", _shows("levels", 0)),
-        Column("Both lower", _shows("both_lower", 0)),
+    total = goal.groupby("method").sum(numeric_only=True).reindex(methods)
+    columns = _methods(evidence, methods)
+    for value in VALUES:
+        columns[f"Mean, levels from {LARGE:g} on", VALUES[value][0]] = _ranked(evidence, value)
+    columns["", "Reached"] = [
+        Cell(DASH if pd.isna(x) else f"{x:g} of {needed}", x == needed) for x in total["both"]
     ]
-    group = "Below the best classical"
-    columns += [Column(VALUES[v][1], partial(of_classical, value=v), group) for v in VALUES]
-    group = f"MCE {LOWER} · CD {LOWER} · both {LOWER} / any {HIGHER}"
+    columns["", "Evaluated"] = [number(x, 0) for x in total["levels"]]
+    columns["", "Both lower"] = [number(x, 0) for x in total["both_lower"]]
+    for value in VALUES:
+        below = zip(total[f"below_classical_{value}"], total["classical_levels"], strict=True)
+        columns["Below the best classical", VALUES[value][1]] = [
+            f"{x:g} of {levels:g}" if levels > 0 else DASH for x, levels in below
+        ]
     for place in dict.fromkeys(zip(goal["dataset"], goal["backbone"], strict=True)):
-        text = f"{_short_place(place)}, of {at(goal, place)['levels'].max()}"
-        columns.append(Column(text, partial(of_place, place=place), group))
-    rows = total.reindex(every).rename_axis("method").reset_index()
+        found = at(goal, place).set_index("method").to_dict("index")
+        columns[GOAL_CELLS, _short_place(place)] = [
+            "{both} / {worse} of {levels}".format(**found[name]) if name in found else DASH
+            for name in methods
+        ]
     reference = evidence.title(evidence.reference)
     return Table(
         "goal",
@@ -202,14 +169,27 @@ def goal_table(evidence: Evidence) -> Table | None:
         f"lower ({LOWER}) than those of {reference} at every level from {LARGE:g} on, on every "
         f"dataset with every backbone, {needed} cells. Reached: cells of these; evaluated: cells "
         "in which the method was evaluated; both lower: with both means lower, significantly or "
-        "not. Mean: over these levels, datasets and backbones, for what was evaluated everywhere; "
-        f"in brackets against {reference}; bold: the lowest. Below the best classical: of all "
-        "levels, those with a mean below that of the best classical method of the level that was "
-        "evaluated on all pairs. By place: levels with a significantly lower mean by MCE, by CD, "
-        "by both, and with a significantly higher one by any.",
-        **laid_out(rows.to_dict("records"), columns),
+        "not. Mean: over these levels, datasets and backbones, of what was evaluated everywhere; "
+        f"in brackets against {reference}; bold: the lowest. Below the best classical: levels with "
+        "a mean below that of the best classical method that was evaluated on all pairs.",
+        **laid_out(columns),
         data=goal,
     )
+
+
+def _ranked(evidence: Evidence, value: str) -> list[Cell]:
+    """The mean at large levels of the reference and every rival, with the change in percent."""
+    methods = [evidence.reference, *evidence.rivals]
+    means = evidence.ranking(methods, value)
+    _, _, scale, decimals = VALUES[value]
+    cells = []
+    for name in methods:
+        text = number(means.get(name), decimals, scale)
+        if name != evidence.reference and {name, evidence.reference} <= set(means.index):
+            change = 100 * (means[name] / means[evidence.reference] - 1)
+            text += f" ({signed(change, 1)} %)"
+        cells.append(Cell(text, name in means.index[:1]))
+    return cells
 
 
 # ------------------------------------------------------------------------------ in detail
@@ -219,7 +199,7 @@ def mean_table(
     evidence: Evidence, place: Place, value: str, *, corrupted: bool = False
 ) -> Table | None:
     """Means of a value by method at a place: by level, or with imperfect targets."""
-    long, name, scale, decimals = VALUES[value]
+    _, name, scale, decimals = VALUES[value]
     if corrupted:
         data = at(evidence.corrupted, place)
         shown = data.assign(level=np.nan, mean=data[value])
@@ -233,70 +213,56 @@ def mean_table(
     marks = marks.loc[marks["value"] == value, ["method", *keys, "verdict"]]
     shown = shown.merge(marks, on=["method", *keys], how="left")
     shown["mean"] = (scale * shown["mean"]).round(decimals)
-    shown["setting"] = shown.groupby(keys, dropna=False).ngroup()
     can_win = shown["method"].isin([evidence.reference, *evidence.rivals]) & ~shown["partial"]
-    lowest = shown["mean"].where(can_win).groupby(shown["setting"]).transform("min")
-    shown["best"] = can_win & (shown["mean"] == lowest)
-    found = {(row["method"], row["setting"]): row for row in shown.to_dict("records")}
-
-    def mean(record: Mapping[str, Any], setting: int) -> Cell:
-        row = found.get((record["method"], setting))
-        if row is None or pd.isna(row["mean"]):
-            return Cell(DASH)
-        mark = MARKS.get(row["verdict"], "")
-        text = f"{row['mean']:.{decimals}f}{PARTIAL if row['partial'] else ''} {mark}"
-        return Cell(text.strip(), row["best"])
-
-    def change(record: Mapping[str, Any], setting: int) -> str:
-        return signed(found.get((record["method"], setting), {}).get(f"{value}_change_percent"), 0)
-
-    columns = _methods(evidence)
-    for row in shown.drop_duplicates("setting").sort_values("setting").to_dict("records"):
-        setting = row["setting"]
+    shown["best"] = shown["mean"].where(can_win)
+    methods = [name for name in evidence.methods if name in set(shown["method"])]
+    columns = _methods(evidence, methods)
+    for (condition, corruption, level), some in shown.groupby(keys, dropna=False):
+        some = some.assign(best=some["best"] == some["best"].min()).set_index("method")
+        rows = some.reindex(methods).to_dict("records")
+        group = "All levels" if pd.isna(level) else "Level"
         if corrupted:
-            levels = row["levels"].replace(" ", ", ")
-            group = f"{names.setting_name(row['condition'], row['corruption'])} (level {levels})"
-            columns.append(Column(name, partial(mean, setting=setting), group))
-            columns.append(Column("% to clean", partial(change, setting=setting), group))
-        elif pd.isna(row["level"]):
-            columns.append(Column(name, partial(mean, setting=setting), "All levels"))
-        else:
-            columns.append(Column(f"{row['level']:g}", partial(mean, setting=setting), "Level"))
-    if not corrupted and value == "mce":
-        columns += _POOLED
-    pooled = at(evidence.pooled, place).set_index("method").to_dict("index")
-    records = [
-        {"method": method, **pooled.get(method, {})}
-        for method in evidence.methods
-        if method in set(shown["method"])
-    ]
+            levels = some["levels"].iloc[0].replace(" ", ", ")
+            group = f"{names.setting_name(condition, corruption)} (level {levels})"
+        label = name if pd.isna(level) else f"{level:g}"
+        columns[group, label] = [_mean_cell(row, decimals) for row in rows]
+        if corrupted:
+            changes = [signed(row[f"{value}_change_percent"], 0) for row in rows]
+            columns[group, "% to clean"] = changes
+        elif pd.isna(level) and value == "mce":
+            columns |= _pooled(rows)
     kind = "with imperfect targets" if corrupted else "by level"
     return Table(
         name=f"{'corrupted_' if corrupted else ''}{value}_{slug(*place)}",
         title=f"{name} {kind}: {evidence.where(*place)}",
         caption=_mean_caption(evidence, place, value, shown, corrupted),
-        **laid_out(records, columns),
+        **laid_out(columns),
         data=data,
     )
 
 
-_POOLED = [
-    Column("Failures (%)", _shows("failure_rate", 1, 100), "All levels"),
-    Column("Folding (%)", _shows("folding_mean", 1, 100), "All levels"),
-    Column("Roughness", _shows("roughness_mean", 3), "All levels"),
-    Column(
-        "Seconds a pair",
-        lambda row: DASH if pd.isna(row["seconds_mean"]) else f"{row['seconds_mean']:.3g}",
-        "All levels",
-    ),
-]
+def _mean_cell(row: Row, decimals: int) -> Cell:
+    if pd.isna(row["mean"]):
+        return Cell(DASH)
+    text = f"{row['mean']:.{decimals}f}{PARTIAL if row['partial'] else ''}"
+    return Cell(_marked(text, row["verdict"]), bool(row["best"]))
+
+
+def _pooled(rows: Sequence[Row]) -> Columns:
+    """What is known besides, over all levels."""
+    group = "All levels"
+    return {
+        (group, "Failures (%)"): [number(row["failure_rate"], 1, 100) for row in rows],
+        (group, "Folding (%)"): [number(row["folding_mean"], 1, 100) for row in rows],
+        (group, "Roughness"): [number(row["roughness_mean"], 3) for row in rows],
+        (group, "Seconds a pair"): [short(float(f"{row['seconds_mean']:.3g}")) for row in rows],
+    }
 
 
 def _mean_caption(
     evidence: Evidence, place: Place, value: str, shown: pd.DataFrame, corrupted: bool
 ) -> str:
     where, long = evidence.where(*place), VALUES[value][0]
-    reference = evidence.title(evidence.reference)
     if corrupted:
         text = (
             f"{where}. {long} to the clean target, mean over test pairs and seeds, and its change "
@@ -306,8 +272,8 @@ def _mean_caption(
         text = f"{where}, clean targets. {long}, mean over test pairs and seeds."
     text += (
         f" Lower is better. Bold: lowest of the methods that register. {LOWER} significantly "
-        f"lower, {HIGHER} significantly higher than {reference} (p < 0.05 after Holm)"
-        f"{' under the same corruption, all these levels together' if corrupted else ''}."
+        f"lower, {HIGHER} significantly higher than {evidence.title(evidence.reference)} (p < 0.05 "
+        f"after Holm){' under the same corruption, levels together' if corrupted else ''}."
     )
     if not corrupted and value == "mce":
         true = evidence.roughness_true[place[0]]
@@ -324,46 +290,44 @@ def answer_table(
     data = data[data["method"].isin(evidence.rivals) & (data["value"] == value)]
     if data.empty:
         return None
-
-    def difference(row: Mapping[str, Any]) -> str:
-        found = [number(row[x], decimals, scale) for x in ("difference", "ci_low", "ci_high")]
-        return found[0] if pd.isna(row["ci_low"]) else f"{found[0]} [{found[1]}, {found[2]}]"
-
-    def relative(row: Mapping[str, Any]) -> Cell:
-        mark = MARKS.get(row["verdict"], "")
-        return Cell(f"{signed(row['relative'], 1)} {mark}".strip(), bool(mark))
-
-    columns = [
-        *_methods(evidence),
-        *([Column("Level", lambda row: f"{row['level']:g}")] if by_level else []),
-        Column("Pairs", lambda row: row["pairs"]),
-        Column("Mean", _shows("mean_method", decimals, scale), long),
-        Column("Reference", _shows("mean_reference", decimals, scale), long),
-        Column("Difference [95 % interval]", difference, long),
-        Column("%", relative, long),
-        Column("p", lambda row: p_value(row["p_holm"]), long),
-        Column("Effect", lambda row: signed(row["effect"], 2), long),
-        Column("Wins (%)", _shows("win_rate", 0, 100), long),
+    rows = data.to_dict("records")
+    columns = _methods(evidence, data["method"])
+    if by_level:
+        columns["", "Level"] = [f"{row['level']:g}" for row in rows]
+    columns["", "Pairs"] = data["pairs"]
+    for label, key in (("Mean", "mean_method"), ("Reference", "mean_reference")):
+        columns[long, label] = [number(row[key], decimals, scale) for row in rows]
+    columns[long, "Difference [95 % interval]"] = [_difference(x, decimals, scale) for x in rows]
+    columns[long, "%"] = [
+        Cell(_marked(signed(row["relative"], 1), row["verdict"]), row["verdict"] in MARKS)
+        for row in rows
     ]
+    columns[long, "p"] = [p_value(row["p_holm"]) for row in rows]
+    columns[long, "Effect"] = [signed(row["effect"], 2) for row in rows]
+    columns[long, "Wins (%)"] = [number(row["win_rate"], 0, 100) for row in rows]
     if value == "mce":
-        columns += [
-            Column("%", _shows("failures_method", 1, 100), "Failures"),
-            Column("Reference %", _shows("failures_reference", 1, 100), "Failures"),
-            Column("p", lambda row: p_value(row["p_failures"]), "Failures"),
-        ]
+        for label, key in (("%", "failures_method"), ("Reference %", "failures_reference")):
+            columns["Failures", label] = [number(row[key], 1, 100) for row in rows]
+        columns["Failures", "p"] = [p_value(row["p_failures"]) for row in rows]
     which = "each level" if by_level else "all levels together"
+    where = evidence.where(*place)
     return Table(
         name=f"{'levels' if by_level else 'answer'}_{value}_{slug(*place)}",
-        title=f"{name} against {evidence.title(evidence.reference)}, {which}: "
-        f"{evidence.where(*place)}",
-        caption=f"{evidence.where(*place)}, clean targets, {which}. Difference: method minus "
-        "reference, so negative is better; interval: bootstrap over objects; %: of the "
-        f"reference's mean; p: Wilcoxon{', after Holm over the levels' if by_level else ''}; "
-        "effect: rank-biserial, −1 to 1; wins: pairs on which the method is lower."
+        title=f"{name} against {evidence.title(evidence.reference)}, {which}: {where}",
+        caption=f"{where}, clean targets, {which}. Difference: method minus reference, so negative "
+        "is better; interval: bootstrap over objects; %: of the reference's mean; p: Wilcoxon"
+        f"{', after Holm over the levels' if by_level else ''}; effect: rank-biserial, −1 to 1; "
+        "wins: pairs on which the method is lower."
         + (" Failures: pairs with an MCE above 0.1, p by McNemar's test." * (value == "mce")),
-        **laid_out(data.to_dict("records"), columns),
+        **laid_out(columns),
         data=data,
     )
+
+
+def _difference(row: Row, decimals: int, scale: float) -> str:
+    text = number(row["difference"], decimals, scale)
+    ends = [number(row[name], decimals, scale) for name in ("ci_low", "ci_high")]
+    return text if pd.isna(row["ci_low"]) else f"{text} [{', '.join(ends)}]"
 
 
 def seed_table(evidence: Evidence) -> Table | None:
@@ -371,44 +335,30 @@ def seed_table(evidence: Evidence) -> Table | None:
     data = evidence.pooled[evidence.pooled["seeds"] > 1]
     if data.empty:
         return None
-    compared = evidence.comparisons
-    compared = compared[(compared["condition"] == CLEAN) & compared["level"].isna()]
-    keys = ["dataset", "backbone", "method"]
-    wide = compared.pivot(index=keys, columns="value", values="difference")
-    wide = wide.reindex(columns=list(VALUES)).add_suffix("_difference").reset_index()
-    order = list(evidence.methods)
-    shown = data.merge(wide, on=keys, how="left")
-    shown = pd.concat(
-        at(shown, place).sort_values("method", key=lambda x: x.map(order.index))
-        for place in evidence.places
-    )
-    columns = [
-        Column("Dataset", lambda row: display_name(row["dataset"])),
-        Column("Backbone", lambda row: display_name(row["backbone"])),
-        Column("Method", lambda row: evidence.title(row["method"])),
-        Column("Seeds", lambda row: f"{row['seeds']:g}"),
-    ]
     labels = {"mean": "Mean", "seed_sd": "sd over seeds", "sd": "sd over pairs"}
-    labels["difference"] = "minus reference"
+    columns: Columns = {
+        ("", "Dataset"): data["dataset"].map(display_name),
+        ("", "Backbone"): data["backbone"].map(display_name),
+        ("", "Method"): data["method"].map(evidence.title),
+        ("", "Seeds"): data["seeds"],
+    }
     for value, (long, _, scale, decimals) in VALUES.items():
-        columns += [
-            Column(text, _shows(f"{value}_{name}", decimals, scale), long)
-            for name, text in labels.items()
-        ]
-    datasets = [d for d in evidence.datasets if (data["dataset"] == d).any()]
+        for name, label in labels.items():
+            column = data[f"{value}_{name}"]
+            columns[long, label] = [number(x, decimals, scale) for x in column]
     return Table(
         name="seeds",
         title="Spread over seeds and over pairs",
-        caption=f"{join([*map(evidence.where, datasets)])}, clean targets, all levels together. "
-        "Sd over seeds: standard deviation of the means of the trainings; sd over pairs: of the "
-        "pairs, averaged over seeds. A difference from the reference no larger than the sd over "
-        "seeds may be luck of the training.",
-        **laid_out(shown.to_dict("records"), columns),
+        caption=f"{_all_data(evidence, dict.fromkeys(data['dataset']))}, clean targets, all levels "
+        "together. Sd over seeds: standard deviation of the means of the trainings; sd over pairs: "
+        "of the pairs, averaged over seeds. A difference from the reference no larger than the sd "
+        "over seeds may be luck of the training.",
+        **laid_out(columns),
         data=data,
     )
 
 
-def diagnostics_table(evidence: Evidence, found: Sequence[Mapping[str, Any]]) -> Table | None:
+def diagnostics_table(evidence: Evidence, found: Sequence[Row]) -> Table | None:
     """What ``diagnose`` found about each prior on fields that were not used for the fit."""
     if not found:
         return None
@@ -416,23 +366,21 @@ def diagnostics_table(evidence: Evidence, found: Sequence[Mapping[str, Any]]) ->
     # A mapping or a list inside would not be a cell.
     data = data[[c for c in data if not data[c].map(lambda x: isinstance(x, dict | list)).any()]]
     data = data[[*(c for c in _DIAGNOSED if c in data), *(c for c in data if c not in _DIAGNOSED)]]
-
-    def shown(row: Mapping[str, Any], name: str) -> str:
-        known = name == "prior" and row[name] in evidence.methods
-        return evidence.title(row[name]) if known else short(row[name])
-
+    titles = {name: method.title for name, method in evidence.methods.items()}
+    priors = data["prior"].map(lambda name: titles.get(name, name))
+    columns = {
+        ("", _DIAGNOSED.get(name, name)): priors if name == "prior" else data[name] for name in data
+    }
+    columns = {key: [short(value) for value in column] for key, column in columns.items()}
     return Table(
         name="diagnostics",
         title="What the priors know",
-        caption=f"{join([evidence.where(d) for d in dict.fromkeys(data['dataset'])])}. Measured on "
-        "fields that were not used for the fit, normalised frame. −log p: negative "
-        "log-likelihood, lower is better; only values per coordinate compare between priors. "
-        "Generalisation: how far the prior's closest field is from a new one, lower is better. "
-        "Specificity: how far samples are from the nearest training field; low is realistic, but "
-        "a prior that repeats what it saw has 0.",
-        **laid_out(
-            data.to_dict("records"),
-            [Column(_DIAGNOSED.get(x, x), partial(shown, name=x)) for x in data],
-        ),
+        caption=f"{_all_data(evidence, dict.fromkeys(data['dataset']))}. Measured on fields that "
+        "were not used for the fit, normalised frame. −log p: negative log-likelihood, lower is "
+        "better; only values per coordinate compare between priors. Generalisation: how far the "
+        "prior's closest field is from a new one, lower is better. Specificity: how far samples "
+        "are from the nearest training field; low is realistic, but a prior that repeats what it "
+        "saw has 0.",
+        **laid_out(columns),
         data=data,
     )
