@@ -36,9 +36,9 @@ check: .venv/installed
 	$(BIN)/snakefmt --check Snakefile workflow/rules
 	$(BIN)/snakemake --lint
 	$(BIN)/dine config check config.yaml
-	$(BIN)/dine config check config.yaml config/tiny.yaml
+	$(BIN)/dine config check config/evidence.yaml config.yaml config/tiny.yaml
 	$(BIN)/dine config check config.yaml config/full.yaml
-	$(BIN)/dine config check config.yaml config/unseen.yaml
+	$(BIN)/dine config check config/evidence.yaml config.yaml config/unseen.yaml
 	$(BIN)/snakemake all -n --quiet
 
 format: .venv/installed

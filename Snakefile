@@ -1,8 +1,11 @@
+from pathlib import Path
+
 from snakemake.utils import min_version
 
 min_version("9.19")
 
 
+configfile: Path(workflow.basedir) / "config" / "evidence.yaml"
 configfile: "config.yaml"
 
 
@@ -16,15 +19,15 @@ include: "workflow/rules/priors.smk"
 include: "workflow/rules/stage2.smk"
 include: "workflow/rules/evaluate.smk"
 include: "workflow/rules/report.smk"
-include: "workflow/rules/pretraining.smk"
 include: "workflow/rules/registration.smk"
+include: "workflow/rules/pretraining.smk"
 include: "workflow/rules/evidence.smk"
 
 
 rule all:
     default_target: True
     input:
-        RESULTS / "report.html",
-        expand(RESULTS / "tables" / "{table}.md", table=TABLES),
-        expand(RESULTS / "figures" / "{figure}.png", figure=FIGURES),
-        kept_files(),
+        FILES.report,
+        [FILES.table(table, "md") for table in TABLES],
+        [FILES.figure(figure, "png") for figure in FIGURES],
+        PLAN.all_kept(),

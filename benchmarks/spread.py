@@ -32,8 +32,8 @@ def read(folder: Path) -> tuple[dict[str, str], pd.DataFrame, pd.DataFrame]:
     settings = dine_config.load(folder / "config.yaml")
     files = Results(folder)
     every = runs(settings)
-    metrics = load_metrics([files.run(*run, "metrics.csv") for run in every])
-    record = read_json(files.run(*every[0], "run.json"))
+    metrics = load_metrics([files.run(*run).metrics for run in every])
+    record = read_json(files.run(*every[0]).record)
     made = {"seed": str(settings.seed), **record["made"]}
     made["λ"] = ", ".join(
         f"{name} {value:g}" for name, value in read_json(files.search)["selected"].items()

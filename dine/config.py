@@ -378,6 +378,14 @@ class Pretraining(Training):
     """Share of the steps whose source is cut down to a part, as scans often show one."""
     objects: Count = 240
     """Synthetic base objects, half primitives and half tissue patches, none used elsewhere."""
+    amplitude: Positive = 0.15
+    """Of their deformations, as in `recipe`: somewhat harder than the default datasets."""
+    levels: dict[Literal["primitives", "tissue"], list[Positive]] = {
+        "primitives": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8],
+        "tissue": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7],
+    }
+    """Levels of deformation of each shape."""
+    split: Split = Split(train=0.9, val=0.05, test=0.05)
 
 
 class Method(Section):
@@ -473,6 +481,8 @@ class Evidence(Section):
     choice: LambdaChoice = LambdaChoice(criterion="mce")
     """How each method's λ is chosen, on the dataset and backbone of `lambda_search`."""
     methods: dict[str, AnyMethod] = {}
+    only: list[str] | None = None
+    """Names of the methods to keep; by default all of them."""
     examples: list[str] = [CONTROL]
     """Methods whose fields are drawn for typical pairs; those of the first one are typical."""
 
@@ -794,11 +804,29 @@ def validate(values: Any, where: str = "the configuration") -> Config:
         evidence = values.get("evidence")
         methods = evidence.get("methods") if isinstance(evidence, dict) else None
         if isinstance(methods, dict):
+            only = evidence.get("only")
+            methods = _only(methods, only) if isinstance(only, list) else methods
+            values = {**values, "evidence": {**evidence, "methods": methods}}
             gone["methods"] = {name for name, entry in methods.items() if entry is None}
         values = {key: _without_null(key, section) for key, section in values.items()}
         _forget(values.get("evidence"), gone)
         _forget_backbones(values, gone)
     return validate_section(Config, values, where)
+
+
+def _only(methods: dict[str, Any], kept: list[Any]) -> dict[str, Any]:
+    """The methods with None for those that are not kept.
+
+    Raises:
+        ConfigError: one that is to be kept is not there.
+    """
+    for name in kept:
+        if not isinstance(name, str) or name not in methods:
+            raise ConfigError(
+                f"`evidence.only` names {name!r}, which is not under `evidence.methods` "
+                f"(there: {', '.join(map(str, methods))})."
+            )
+    return {name: entry if name in kept else None for name, entry in methods.items()}
 
 
 def _forget_backbones(values: dict[str, Any], gone: dict[str, set[str]]) -> None:

@@ -36,14 +36,14 @@ NEUTRAL = frozenset(
         ".cli",
         ".config",
         ".errors",
-        ".files",
         ".progress",
         ".provenance",
         ".registry",
         ".results",
     )
 )
-"""Modules that everything uses: what they do to results is in the settings, or nothing."""
+"""Modules that everything uses and whose code is in no result: settings reach a step as parameters,
+with all their defaults."""
 
 _DATA = re.compile(r"""["']([\w-]+\.(?:html|csv|js|txt))["']""")
 _REGISTERED = re.compile(r"""\.register\("(\w+)"\)""")
@@ -53,7 +53,7 @@ _LIBRARIES = frozenset({"site-packages", "dist-packages"})
 
 @functools.cache
 def code_digest(step: str, *classes: str) -> str:
-    """Digest of the code behind a step: changes when that does.
+    """Digest of the code behind a step: changes when that does, not with comments or docstrings.
 
     Args:
         step: a command of ``dine``, such as ``fit-prior``.
@@ -66,8 +66,25 @@ def code_digest(step: str, *classes: str) -> str:
     digest = hashlib.sha256(_command(step)[0].encode())
     for name, file in sorted(code_files(step, *classes).items()):
         digest.update(name.encode())
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
+        digest.update(_meaning(file))
     return digest.hexdigest()[:16]
+
+
+@functools.cache
+def _meaning(file: Path) -> bytes:
+    """Digest of what a file says: of Python its syntax tree, of anything else its bytes."""
+    content = _tree(_parsed(file)).encode() if file.suffix == ".py" else file.read_bytes()
+    return hashlib.sha256(content).digest()
+
+
+def _tree(node: Any) -> str:
+    """A syntax tree as text; without empty fields, which come and go with Python's versions."""
+    if isinstance(node, list):
+        return f"[{','.join(map(_tree, node))}]"
+    if not isinstance(node, ast.AST):
+        return repr(node)
+    fields = [(name, value) for name, value in ast.iter_fields(node) if value not in (None, [])]
+    return f"{type(node).__name__}({','.join(f'{name}={_tree(x)}' for name, x in fields)})"
 
 
 @functools.cache
@@ -91,8 +108,7 @@ def _command(step: str) -> tuple[str, tuple[str, ...]]:
     name = step.replace("-", "_")
     for node in _parsed(PACKAGE / "cli.py").body:
         if isinstance(node, ast.FunctionDef) and node.name == name:
-            body = node.body[1:] if ast.get_docstring(node) else node.body
-            return ast.dump(ast.Module(body, [])), tuple(_imports(body, "dine.cli", False))
+            return _tree(node.body), tuple(_imports(node.body, "dine.cli", False))
     raise KeyError(step)
 
 
@@ -157,10 +173,22 @@ def _add_data(file: Path, found: dict[str, Path]) -> None:
 
 @functools.cache
 def _parsed(file: Path) -> ast.Module:
+    """The syntax tree of a module, without docstrings and other statements that are mere text."""
     try:
-        return ast.parse(file.read_bytes(), str(file))
+        tree = ast.parse(file.read_bytes(), str(file))
     except (OSError, SyntaxError, ValueError) as error:
         raise ConfigError(f"{file} cannot be read as Python: {error}.") from None
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [statement for statement in node.body if not _is_text(statement)]
+    return tree
+
+
+def _is_text(statement: ast.stmt) -> bool:
+    """Whether a statement is a string and nothing else, as a docstring is."""
+    if not isinstance(statement, ast.Expr) or not isinstance(statement.value, ast.Constant):
+        return False
+    return isinstance(statement.value.value, str)
 
 
 @functools.cache

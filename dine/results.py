@@ -28,33 +28,109 @@ PAPER_TABLES = {("deformedtissue", False): 1, ("synbench", False): 2, ("deformed
 """Number of the paper's table by dataset and whether targets are corrupted."""
 
 
-def condition_key(condition: str, corruption: float) -> str:
+def condition_key(condition: str, corruption: float | str) -> str:
     """Name of a condition in files: ``deformation``, ``noise_0.03``, ``outliers_25``,
     ``resampled_1``."""
-    return condition if condition == CLEAN else f"{condition}_{corruption:g}"
+    strength = corruption if isinstance(corruption, str) else f"{corruption:g}"
+    return condition if condition == CLEAN else f"{condition}_{strength}"
+
+
+def _named(name: str) -> property:
+    return property(lambda self: self.folder / name)
+
+
+@dataclass(frozen=True)
+class Data:
+    """Files that are made of one dataset, in a folder of its own."""
+
+    folder: Path
+
+    raw = _named("raw.json")
+    inventory = _named("inventory.csv")
+    left_out = _named("left_out.csv")
+    pairs = _named("pairs.h5")
+    agreement = _named("agreement.json")
+    resampled = _named("resampled.h5")
+    """Targets of other points for all pairs."""
+
+    def variant(self, condition: str, corruption: float | str) -> Path:
+        """Targets of one condition for test pairs."""
+        return self.folder / "variants" / f"{condition_key(condition, corruption)}.h5"
+
+
+@dataclass(frozen=True)
+class Network:
+    """Files of one training, and of what is done with its network."""
+
+    folder: Path
+
+    model = _named("model.safetensors")
+    history = _named("history.csv")
+    record = _named("run.json")
+    predictions = _named("predictions.h5")
+    metrics = _named("metrics.csv")
+    point_errors = _named("point_errors.h5")
+    calibration = _named("calibration.json")
+    calibration_plot = _named("calibration.png")
+    prior = _named("prior.safetensors")
+    """Of pretrained weights; others are by name in :meth:`Results.prior`."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """Paths below ``root``; a run is ``stage1`` or ``stage2/<variant>``."""
+    """Paths below ``root``. Wildcards of Snakemake, such as ``{dataset}``, may stand for names."""
 
     root: Path
 
-    def dataset(self, dataset: str, file: str) -> Path:
-        return self.root / dataset / file
+    @property
+    def config(self) -> Path:
+        return self.root / "config.yaml"
 
-    def variant(self, dataset: str, condition: str, corruption: float) -> Path:
-        return self.root / dataset / "variants" / f"{condition_key(condition, corruption)}.h5"
+    @property
+    def report(self) -> Path:
+        return self.root / "report.html"
 
-    def run(self, dataset: str, backbone: str, method: str, file: str) -> Path:
-        folder = STAGE1 if method == STAGE1 else f"stage2/{method}"
-        return self.root / dataset / backbone / folder / file
+    def log(self, *parts: str) -> Path:
+        return self._below("logs", *parts, suffix=".log")
+
+    def benchmark(self, *parts: str) -> Path:
+        return self._below("benchmarks", *parts, suffix=".tsv")
+
+    def table(self, name: str, suffix: str) -> Path:
+        return self._below("tables", name, suffix=f".{suffix}")
+
+    def figure(self, name: str, suffix: str) -> Path:
+        return self._below("figures", name, suffix=f".{suffix}")
+
+    def ablation(self, prior: str) -> Path:
+        """The table of one prior alone."""
+        return self._below("ablation", prior, "all", suffix=".md")
+
+    def _below(self, *parts: str, suffix: str) -> Path:
+        *folders, name = parts
+        return self.root.joinpath(*folders, f"{name}{suffix}")
+
+    def data(self, dataset: str) -> Data:
+        return Data(self.root / dataset)
+
+    def unseen(self, dataset: str) -> Data:
+        """Further objects of a dataset, which nothing is trained on."""
+        return Data(self.root / dataset / "unseen")
+
+    def network(self, dataset: str, backbone: str, run: str) -> Network:
+        """Of a run: ``stage1`` or ``stage2/<method>``."""
+        return Network(self.root / dataset / backbone / run)
+
+    def run(self, dataset: str, backbone: str, method: str) -> Network:
+        """The same, by the method's name."""
+        return self.network(dataset, backbone, STAGE1 if method == STAGE1 else f"stage2/{method}")
+
+    def fields(self, dataset: str, backbone: str) -> Path:
+        """Displacement fields of Stage 1 on the training split."""
+        return self.root / dataset / backbone / "dvf.h5"
 
     def prior(self, dataset: str, backbone: str, prior: str) -> Path:
         return self.root / dataset / backbone / "priors" / f"{prior}.safetensors"
-
-    def evidence(self, *parts: str) -> Path:
-        return self.root.joinpath("evidence", *parts)
 
     @property
     def search(self) -> Path:
@@ -63,6 +139,48 @@ class Results:
     def search_of(self, backbone: str) -> Path:
         """The search of λ with a backbone of its own."""
         return self.root / "lambda" / backbone / "lambda.json"
+
+    def pretraining_data(self, shape: str) -> Data:
+        return Data(self.root / "pretraining" / shape)
+
+    def pretrained(self, backbone: str) -> Network:
+        return Network(self.root / "pretraining" / backbone)
+
+    def pretraining_fields(self, backbone: str, shape: str) -> Path:
+        return self.root / "pretraining" / backbone / f"fields_{shape}.h5"
+
+    @property
+    def evidence(self) -> Evidence:
+        return Evidence(self.root / "evidence")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Files of the evidence."""
+
+    folder: Path
+
+    report = _named("report.html")
+
+    def data(self, dataset: str) -> Data:
+        return Data(self.folder / dataset)
+
+    def cell(self, dataset: str, backbone: str, seed: int | str, method: str) -> Network:
+        """What one method makes of a dataset's test pairs."""
+        return Network(self.folder / dataset / backbone / f"seed{seed}" / method)
+
+    def metrics(self, dataset: str, backbone: str, seed: int | str) -> Path:
+        """Of all methods with one backbone and seed."""
+        return self.folder / dataset / backbone / f"seed{seed}" / "metrics.csv"
+
+    def search(self, method: str) -> Path:
+        return self.folder / "lambda" / f"{method}.json"
+
+    def diagnostics(self, dataset: str, backbone: str, prior: str, suffix: str = "json") -> Path:
+        return self.folder / "diagnostics" / dataset / backbone / f"{prior}.{suffix}"
+
+    def examples(self, dataset: str, suffix: str = "png") -> Path:
+        return self.folder / dataset / f"examples.{suffix}"
 
 
 def conditions(config: Config, dataset: str) -> list[tuple[str, float]]:

@@ -82,6 +82,7 @@ def fresh(monkeypatch):
         for found in (
             provenance.code_digest,
             provenance.code_files,
+            provenance._meaning,
             provenance._command,
             provenance._registered,
             provenance._parsed,

@@ -1,12 +1,15 @@
 """The configuration refuses what cannot work, naming key, value and what was expected."""
 
+import functools
 import json
 from pathlib import Path
 
 import pytest
 import yaml
+from click.testing import CliRunner
 
 from dine import config
+from dine.cli import cli
 from dine.errors import ConfigError
 from dine.results import (
     NO_BACKBONE,
@@ -23,7 +26,8 @@ from dine.results import (
 )
 
 ROOT = Path(__file__).parents[1]
-DEFAULT = yaml.safe_load((ROOT / "config.yaml").read_text())
+FILES = (ROOT / "config" / "evidence.yaml", ROOT / "config.yaml")  # as the Snakefile reads them
+DEFAULT = functools.reduce(config.merge, map(config.read_yaml, FILES))
 
 
 def changed(path, value):
@@ -35,7 +39,7 @@ def changed(path, value):
 
 
 def test_default_is_valid_and_complete():
-    loaded = config.load(ROOT / "config.yaml")
+    loaded = config.load(*FILES)
     assert list(loaded.datasets) == ["deformedtissue", "synbench"]
     assert loaded.methods("deftransnet") == ["stage1", "lambda0", "pca", "pca_residual", "flow"]
     assert {"table1", "table2", "table3"} <= set(table_names(loaded))
@@ -47,6 +51,7 @@ def test_sizes_differ_in_numbers_only(name):
     change = yaml.safe_load((ROOT / "config" / f"{name}.yaml").read_text())
     results = change.pop("results")
     assert results == f"results/{name}"
+    change.get("evidence", {}).pop("only", None)
 
     def leaves(value):
         if isinstance(value, dict):
@@ -59,14 +64,13 @@ def test_sizes_differ_in_numbers_only(name):
 
     # Null leaves out a method or backbone.
     assert all(leaf is None or isinstance(leaf, int | float) for leaf in leaves(change))
-    config.load(ROOT / "config.yaml", ROOT / "config" / f"{name}.yaml")
+    config.load(*FILES, ROOT / "config" / f"{name}.yaml")
 
 
-def test_schema_file_is_in_step_with_the_code():
-    stored = json.loads((ROOT / "workflow" / "schemas" / "config.schema.json").read_text())
-    assert stored == config.Config.model_json_schema(), (
-        "run: dine config schema > workflow/schemas/config.schema.json"
-    )
+def test_the_schema_has_every_key():
+    schema = json.loads(CliRunner().invoke(cli, ["config", "schema"]).output)
+    assert set(schema["properties"]) == set(config.Config.model_fields)
+    assert set(schema["$defs"]["Stage1"]["properties"]) == set(config.Stage1.model_fields)
 
 
 @pytest.mark.parametrize(
@@ -180,10 +184,7 @@ def test_a_prior_by_import_path_takes_any_arguments():
 
 
 def with_evidence(**changes):
-    values = config.merge(
-        config.read_yaml(ROOT / "config.yaml"), {"evidence": {"methods": {}, **changes}}
-    )
-    return config.validate(values)
+    return config.validate(config.merge(DEFAULT, {"evidence": {"methods": {}, **changes}}))
 
 
 def test_every_seed_trains_what_the_config_says():
@@ -312,7 +313,7 @@ def test_a_single_value_of_lambda_needs_no_search():
 
 
 def test_backbones_may_be_for_some_datasets():
-    loaded = config.load(ROOT / "config.yaml")
+    loaded = config.load(*FILES)
     assert loaded.backbones_of("deformedtissue") == ["robust_defreg", "deftransnet"]
     assert loaded.backbones_of("synbench") == list(loaded.backbones)
     places = {(dataset, backbone) for dataset, backbone, _ in runs(loaded)}
@@ -381,7 +382,7 @@ def test_gains_are_expected_of_datasets_whose_backbones_have_priors():
 
 
 def test_conditions_hold_targets_of_other_points():
-    loaded = config.load(ROOT / "config.yaml")
+    loaded = config.load(*FILES)
     assert conditions(loaded, "synbench") == [("resampled", 1.0)]
     assert [name for name, _ in conditions(loaded, "deformedtissue")] == [
         *["noise"] * 3,
@@ -399,3 +400,21 @@ def test_the_evidence_may_show_priors_that_no_backbone_has():
     backbones = {name: {"priors": ["pca"]} for name in DEFAULT["backbones"]}
     loaded = config.validate(changed("backbones", backbones))
     assert "pca_residual" in loaded.evidence.examples
+
+
+def test_the_evidence_may_be_of_some_methods_only():
+    loaded = config.validate(changed("evidence.only", ["map", "cpd"]))
+    assert list(loaded.evidence.methods) == ["cpd", "map"]
+    assert loaded.evidence.examples == ["lambda0", "pca", "pca_residual", "cpd", "map"]
+    fewer = config.validate(changed("evidence.only", ["map"]))
+    assert "cpd" not in fewer.evidence.examples
+    with pytest.raises(ConfigError, match=r"`evidence\.only` names 'mop', which is not under"):
+        config.validate(changed("evidence.only", ["mop"]))
+    with pytest.raises(ConfigError, match=r"`evidence\.only` names \['map'\]"):
+        config.validate(changed("evidence.only", [["map"]]))
+
+
+def test_the_default_run_needs_nothing_of_the_evidence():
+    plain = config.load(ROOT / "config.yaml")
+    assert runs(plain) == runs(config.load(*FILES))
+    assert not plain.evidence.methods

@@ -34,7 +34,8 @@ def test_code_is_found_through_imports():
     # Templates and tables are code, too.
     assert "reporting/published_results.csv" in code_of("tables")
     assert "reporting/report.html" in code_of("report") & code_of("evidence")
-    assert not {"cli", "config", "files"} & (raw | corrupt | train)
+    assert not {"cli", "config"} & (raw | corrupt | train)
+    assert "files" in raw & corrupt & train
 
 
 def test_only_the_classes_that_are_picked_count():
@@ -85,7 +86,10 @@ def test_a_users_own_code_counts_with_what_it_imports(own, fresh, name, edited, 
     assert before != code_digest("fit-prior")
     assert "dine.geometry.chamfer" in code_files("fit-prior", name)
     assert not any(module.startswith("numpy") for module in code_files("fit-prior", name))
-    (own / edited).write_text(PACKAGE[edited] + "\n")
+    (own / edited).write_text(PACKAGE[edited] + "\n# A remark.\n")
+    fresh()
+    assert code_digest("fit-prior", name) == before
+    (own / edited).write_text(PACKAGE[edited] + "\nADDED = 1\n")
     fresh()
     assert (code_digest("fit-prior", name) != before) == counts
     # Nothing of it was run to find that out.
@@ -121,12 +125,20 @@ def test_the_digest_follows_the_code_of_the_package(tmp_path, monkeypatch, fresh
         return [step for step in steps if code_digest(*step) != before.pop(0)]
 
     def longer(text):
-        return text + "\n"
+        return text + "\nADDED = 1\n"
+
+    def reworded(text):
+        return text.replace('"""', '"""In other words: ', 1) + "\n\n# A remark.\n"
 
     assert changed_by("priors/flow.py", longer) == [("fit-prior", "flow")]
     assert changed_by("training/loop.py", longer) == [("stage1", "chamfer")]
+    assert changed_by("training/loop.py", reworded) == []
+    assert changed_by("training/loop.py", lambda text: text.replace("0.01 +", "0.02 +")) == [
+        ("stage1", "chamfer")
+    ]
     assert changed_by("reporting/published_results.csv", longer) == [("tables",)]
-    assert changed_by("files.py", longer) == []
+    assert changed_by("files.py", longer) == steps
+    assert changed_by("files.py", reworded) == []
     # Of the command line, each step has its own command, without the help.
     assert changed_by("cli.py", lambda text: text.replace("Aggregate metrics", "Sum up")) == []
     assert changed_by(

@@ -15,6 +15,7 @@ from dine.errors import DataError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json
 from dine.progress import LOG_SECONDS
 from dine.provenance import folder_signature
+from dine.results import Data
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +75,7 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
         content = digest(source.model_dump())
     else:
         content = file_digest(made / "provenance.json")
-    write_json(folder / "raw.json", {"folder": str(place), "origin": origin, "content": content})
+    write_json(Data(folder).raw, {"folder": str(place), "origin": origin, "content": content})
 
 
 class _Download:
@@ -92,18 +93,19 @@ class _Download:
 
 def report(inventory: Inventory, folder: Path) -> None:
     """Write what was found and what was left out as CSV."""
-    with atomic_path(folder / "inventory.csv") as temporary:
+    files = Data(folder)
+    with atomic_path(files.inventory) as temporary:
         inventory.table().to_csv(temporary, index=False)
     left_out = pd.DataFrame(
         [(str(path), reason) for path, reason in inventory.left_out], columns=["file", "reason"]
     )
-    with atomic_path(folder / "left_out.csv") as temporary:
+    with atomic_path(files.left_out) as temporary:
         left_out.to_csv(temporary, index=False)
     log.info(
         "%d pairs found, %d files left out (listed in %s)",
         len(inventory.pairs),
         len(inventory.left_out),
-        folder / "left_out.csv",
+        files.left_out,
     )
 
 

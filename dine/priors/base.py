@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from dine.config import PRIOR_ARGUMENTS, Section, validate_section
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.models.checkpoint import load_tensors, rebuilt, save_tensors
 from dine.priors.gaussian import LinearGaussian
+from dine.priors.sources import check_sources
 from dine.registry import Registry
 
 PRIORS: Registry[Prior] = Registry("prior")
@@ -24,13 +26,28 @@ LARGEST_DEPTH = 1000
 """Of layers, likewise."""
 
 
+class Sample(NamedTuple):
+    """What a prior is fitted to.
+
+    Attributes:
+        fields: (K, N, 3) displacement fields, float64.
+        source: (K, N, 3) the points that move; None if they are not known.
+        seed: of whatever the fit draws.
+    """
+
+    fields: np.ndarray
+    source: np.ndarray | None
+    seed: int
+
+
 class Prior(nn.Module):
     """A density over displacement fields (B, N, 3) in the normalised frame, frozen once fitted.
 
     A subclass is registered in :data:`PRIORS` (or named by import path), builds itself from
     ``shape`` (whatever its tensors' sizes depend on), and implements :meth:`fit`,
     :meth:`penalty`, :meth:`log_prob` and :meth:`sample`. Its buffers and parameters are what is
-    saved.
+    saved. A built-in one implements :meth:`_fit` in place of :meth:`fit`; its arguments and their
+    defaults are a section of the configuration (``dine.config.PRIOR_ARGUMENTS``).
 
     Some priors are conditioned on the source, p(D | X). They set ``conditional`` and raise a
     ``ConfigError`` where the source is left out; the others ignore it. Some are fitted in many
@@ -60,7 +77,32 @@ class Prior(nn.Module):
         source: np.ndarray | None = None,
         **arguments: Any,
     ) -> Self:
-        """Estimate the prior from (K, N, 3) displacement fields of (K, N, 3) sources."""
+        """Estimate the prior from (K, N, 3) displacement fields of (K, N, 3) sources.
+
+        Args:
+            fields: at least two.
+            seed: of whatever the fit draws.
+            source: the points that move; only conditional priors need them.
+            arguments: keys of the prior's section of the configuration, defaults where left out;
+                of a ``resumable`` prior ``unfinished``, too.
+
+        Raises:
+            ConfigError: an unknown argument or one out of range, or sources are missing.
+            DataError: fewer fields than the prior needs, a bad shape, values that are not finite,
+                or fields that leave nothing to be fitted.
+            Interrupted: SIGTERM or SIGINT came, and the state is saved.
+        """
+        more = {"unfinished": arguments.pop("unfinished", None)} if cls.resumable else {}
+        where = f"arguments of the {cls.registered_name} prior"
+        given = validate_section(PRIOR_ARGUMENTS[cls.registered_name], arguments, where)
+        fields = check_fields(fields)
+        if source is not None or cls.conditional:
+            source = check_sources(source, fields, cls.registered_name)
+        return cls._fit(Sample(fields, source, seed), given, **more).freeze()
+
+    @classmethod
+    def _fit(cls, sample: Sample, given: Section) -> Self:
+        """The fit itself, with checked fields and complete arguments."""
         raise NotImplementedError
 
     def penalty(

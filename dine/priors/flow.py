@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, check_fields, check_sizes
+from dine.config import FlowArguments
+from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, Sample, check_sizes
 from dine.priors.likelihood import Unfinished, maximise_likelihood
 
 
@@ -35,55 +36,40 @@ class FlowPrior(Prior):
         )
 
     @classmethod
-    def fit(
-        cls,
-        fields: np.ndarray,
-        *,
-        seed: int = 0,
-        source: np.ndarray | None = None,
-        transforms: int = 6,
-        hidden: int = 256,
-        steps: int = 600,
-        batch_size: int = 2048,
-        learning_rate: float = 1e-3,
-        unfinished: Unfinished | None = None,
+    def _fit(
+        cls, sample: Sample, given: FlowArguments, *, unfinished: Unfinished | None = None
     ) -> Self:
-        """Maximum likelihood on the pooled vectors of (K, N, 3) fields, whatever their sources.
+        """Maximum likelihood on the pooled vectors of the fields, whatever their sources.
 
         A tenth of the fields is held out; ``notes`` keeps both negative log-likelihoods.
         ``unfinished`` is where the fit's state is kept.
-
-        Raises:
-            DataError: fewer than two fields or a bad shape.
-            Interrupted: SIGTERM or SIGINT came, and the state is saved.
         """
-        fields = check_fields(fields)
+        fields, seed = sample.fields, sample.seed
         order = np.random.default_rng(seed).permutation(len(fields))
         held = max(1, len(fields) // 10)
         pool = torch.from_numpy(fields[order[held:]].reshape(-1, 3)).float()
         held_out = torch.from_numpy(fields[order[:held]].reshape(-1, 3)).float()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            prior = cls(points=fields.shape[1], transforms=transforms, hidden=hidden)
+            prior = cls(fields.shape[1], given.transforms, given.hidden)
         prior.mean.copy_(pool.mean(0))
         prior.scale.copy_(pool.std(0).clamp_min(1e-6))
 
         def draw(generator: torch.Generator) -> Tensor:
             return pool[torch.randint(len(pool), (count,), generator=generator)]
 
-        count = min(batch_size, len(pool))
-        optimiser = torch.optim.AdamW(prior.flow.parameters(), lr=learning_rate)
+        count = min(given.batch_size, len(pool))
+        optimiser = torch.optim.AdamW(prior.flow.parameters(), lr=given.learning_rate)
         maximise_likelihood(
             prior.flow,
             prior._log_density,
             draw,
             optimiser,
-            steps=steps,
+            steps=given.steps,
             seed=seed,
-            schedule=torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps),
+            schedule=torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, given.steps),
             unfinished=unfinished,
         )
-        prior.freeze()
         prior.notes = {
             "samples": len(fields),
             "nll_train": -prior._log_density(pool[: 2**17]).mean().item(),

@@ -14,18 +14,16 @@ from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from dine.config import GaussianProcessArguments
 from dine.errors import ConfigError, DataError
-from dine.priors.base import PRIORS, Prior, check_fields, check_sizes
+from dine.priors.base import PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian, covariance_root
 from dine.priors.sources import (
     SourceCache,
-    check_sources,
     members,
     one_source,
     source_labels,
 )
-
-WIDTHS = (0.2, 0.4, 0.8, 1.6)
 
 _TOLERANCE = 1e-6  # of the largest variance: where a root counts as exact
 
@@ -98,45 +96,30 @@ class GaussianProcessPrior(Prior):
         self._factors: SourceCache[Factor] = SourceCache()
 
     @classmethod
-    def fit(
-        cls,
-        fields: np.ndarray,
-        *,
-        seed: int = 0,
-        source: np.ndarray | None = None,
-        widths: Sequence[float] = WIDTHS,
-        rank: int = 128,
-        points: int = 256,
-        sources: int = 64,
-        least_noise: float = 1e-3,
-    ) -> Self:
-        """Amplitudes and noise of highest likelihood for (K, N, 3) fields of (K, N, 3) sources.
+    def _fit(cls, sample: Sample, given: GaussianProcessArguments) -> Self:
+        """Amplitudes and noise of highest likelihood.
 
         Seven numbers or so need no more than a part of the data: at most ``points`` points of each
         field, evenly spaced by index, and the fields of at most ``sources`` different sources,
         drawn by the seed. ``notes["nll_per_coordinate"]`` is the negative log-likelihood of these
         per coordinate.
-
-        Raises:
-            ConfigError: no sources.
-            DataError: fewer than two fields, a bad shape, or fields that are zero everywhere.
         """
-        fields = check_fields(fields)
-        source = check_sources(source, fields, cls.registered_name)
+        fields, source, seed = sample
         if not fields.any():
             raise DataError("All displacement fields are zero; a prior cannot be fitted to them.")
-        few = np.linspace(0, fields.shape[1] - 1, min(points, fields.shape[1])).round().astype(int)
+        points = min(given.points, fields.shape[1])
+        few = np.linspace(0, fields.shape[1] - 1, points).round().astype(int)
         labels = source_labels(source, len(fields))
-        chosen = np.random.default_rng(seed).permutation(np.unique(labels))[:sources]
+        chosen = np.random.default_rng(seed).permutation(np.unique(labels))[: given.sources]
         groups = []
         for label in np.sort(chosen):
             rows = np.flatnonzero(labels == label)
             # All coordinates of all fields of a source are draws from the same Gaussian.
             values = fields[rows][:, few].transpose(1, 0, 2).reshape(len(few), -1)
             groups.append((source[rows[0], few], values))
-        fitted, nll = _most_likely(groups, widths, least_noise)
+        fitted, nll = _most_likely(groups, given.widths, given.least_noise)
 
-        prior = cls(widths=widths, rank=rank)
+        prior = cls(widths=given.widths, rank=given.rank)
         prior.amplitudes.copy_(torch.from_numpy(fitted[:-2]))
         prior.affine.fill_(fitted[-2])
         prior.noise.fill_(fitted[-1])
@@ -150,7 +133,7 @@ class GaussianProcessPrior(Prior):
             "affine": float(fitted[-2]),
             "noise": float(fitted[-1]),
         }
-        return prior.freeze()
+        return prior
 
     def scales(self) -> tuple[tuple[float, ...], float, float]:
         """Amplitudes, affine amplitude and noise as plain numbers."""

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dine.config import LatentFlowArguments
 from dine.errors import DataError
-from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, check_fields, check_sizes
+from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian
 from dine.priors.likelihood import Best, Unfinished, maximise_likelihood
 from dine.priors.pca_residual import PCAResidualPrior
-from dine.priors.sources import check_sources, held_out_folds, source_labels
+from dine.priors.sources import held_out_folds, source_labels
 
 CHECK_EVERY = 10
 """Optimiser steps between two looks at the held-out fields."""
@@ -48,44 +49,21 @@ class LatentFlowPrior(PCAResidualPrior):
             torch.nn.init.zeros_(coupling.hyper[-1].bias)
 
     @classmethod
-    def fit(
-        cls,
-        fields: np.ndarray,
-        *,
-        seed: int = 0,
-        source: np.ndarray | None = None,
-        components: int = 64,
-        shrinkage: float = 0.05,
-        epsilon_std: float = 1e-6,
-        epsilon_covariance: float = 1e-3,
-        folds: int = 5,
-        transforms: int = 4,
-        hidden: int = 64,
-        steps: int = 600,
-        patience: int = 200,
-        batch_size: int = 64,
-        learning_rate: float = 3e-4,
-        weight_decay: float = 0.1,
-        unfinished: Unfinished | None = None,
+    def _fit(
+        cls, sample: Sample, given: LatentFlowArguments, *, unfinished: Unfinished | None = None
     ) -> Self:
-        """Maximum likelihood on nine tenths of the (K, N, 3) fields; the best held-out state wins.
+        """Maximum likelihood on nine tenths of the fields, at least three; the best held-out wins.
 
         With as many components as a hundred fields allow, a flow soon knows them by heart. So a
         tenth of the fields, which span and residual do not see either, decides when to stop: the
         state with their highest likelihood is kept, the Gaussian at the start included. Where the
-        sources (K, N, 3) are given, all fields of a source are held out or none.
+        sources are given, all fields of a source are held out or none.
 
         ``notes`` has negative log-likelihoods of y per component: of the fields of the fit, of the
         held-out ones, and of these under the Gaussian. ``unfinished`` is where the state of the
         flow's fit is kept.
-
-        Raises:
-            DataError: fewer than four fields, a bad shape, or fields that are all equal.
-            Interrupted: SIGTERM or SIGINT came, and the state is saved.
         """
-        fields = check_fields(fields)
-        if source is not None:
-            source = check_sources(source, fields, cls.registered_name)
+        fields, source, seed = sample
         labels = source_labels(source, len(fields))
         held = held_out_folds(labels, 10, seed)[0]
         if np.count_nonzero(~held) < 3:
@@ -93,37 +71,36 @@ class LatentFlowPrior(PCAResidualPrior):
                 "The latent_flow prior needs at least 3 displacement fields besides those held "
                 f"out; found {np.count_nonzero(~held)} of {len(fields)}."
             )
-        span = (components, shrinkage, epsilon_std, epsilon_covariance)
+        sizes = {"transforms": given.transforms, "hidden": given.hidden}
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            prior = cls._of_span(fields[~held], *span, transforms=transforms, hidden=hidden)
-        prior._fit_residual(fields[~held], labels[~held], folds, seed)
+            prior = cls._of_span(fields[~held], given, **sizes)
+        prior._fit_residual(fields[~held], labels[~held], given.folds, seed)
         seen, unseen = (
             prior.whitened(prior.latent(torch.from_numpy(part).to(prior.mean)))
             for part in (fields[~held], fields[held])
         )
         best = Best(
-            prior.flow, lambda: prior._negative_log_likelihood(unseen), CHECK_EVERY, patience
+            prior.flow, lambda: prior._negative_log_likelihood(unseen), CHECK_EVERY, given.patience
         )
         gaussian = best.value
 
         def draw(generator: torch.Generator) -> Tensor:
-            return seen[torch.randperm(len(seen), generator=generator)[:batch_size]]
+            return seen[torch.randperm(len(seen), generator=generator)[: given.batch_size]]
 
         optimiser = torch.optim.AdamW(
-            prior.flow.parameters(), lr=learning_rate, weight_decay=weight_decay
+            prior.flow.parameters(), lr=given.learning_rate, weight_decay=given.weight_decay
         )
         maximise_likelihood(
             prior.flow,
             prior._log_density,
             draw,
             optimiser,
-            steps=steps,
+            steps=given.steps,
             seed=seed,
             best=best,
             unfinished=unfinished,
         )
-        prior.freeze()
         prior.notes |= {
             "held_out": int(np.count_nonzero(held)),
             "steps": best.step,

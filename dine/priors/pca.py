@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dine.config import PCAArguments
 from dine.errors import DataError
-from dine.priors.base import PRIORS, Prior, check_fields, check_sizes
+from dine.priors.base import PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian
 
 log = logging.getLogger(__name__)
@@ -38,48 +39,25 @@ class PCAPrior(Prior):
         self.register_buffer("covariance", torch.eye(components))
 
     @classmethod
-    def fit(
-        cls,
-        fields: np.ndarray,
-        *,
-        seed: int = 0,
-        source: np.ndarray | None = None,
-        components: int = 64,
-        shrinkage: float = 0.05,
-        epsilon_std: float = 1e-6,
-        epsilon_covariance: float = 1e-3,
-    ) -> Self:
-        """Fit to (K, N, 3) fields; nothing depends on ``seed`` and ``source``.
+    def _fit(cls, sample: Sample, given: PCAArguments) -> Self:
+        """Of the fields alone.
 
         K fields span at most K − 1 directions about their mean, so fewer components are kept when
         K is small; ``notes["components_requested"]`` then tells what was asked for.
-
-        Raises:
-            DataError: fewer than two fields, a bad shape, or fields that are all equal.
         """
-        span = (components, shrinkage, epsilon_std, epsilon_covariance)
-        return cls._of_span(fields, *span).freeze()
+        return cls._of_span(sample.fields, given)
 
     @classmethod
-    def _of_span(
-        cls,
-        fields: np.ndarray,
-        components: int,
-        shrinkage: float,
-        epsilon_std: float,
-        epsilon_covariance: float,
-        **shape: Any,
-    ) -> Self:
+    def _of_span(cls, fields: np.ndarray, given: PCAArguments, **shape: Any) -> Self:
         """The prior with span and latent covariance of the fields; ``shape`` goes to the class."""
         # Only fitting needs scikit-learn, which takes a while to import.
         from sklearn.covariance import empirical_covariance, shrunk_covariance
         from sklearn.decomposition import PCA
 
-        fields = check_fields(fields)
         flat = fields.reshape(len(fields), -1)
-        kept = min(components, len(flat) - 1, flat.shape[1])
+        kept = min(given.components, len(flat) - 1, flat.shape[1])
         mean = flat.mean(axis=0)
-        scale = flat.std(axis=0) + epsilon_std
+        scale = flat.std(axis=0) + given.epsilon_std
         normalised = (flat - mean) / scale
         if not normalised.any():
             raise DataError("All displacement fields are equal; a prior cannot be fitted to them.")
@@ -88,8 +66,8 @@ class PCAPrior(Prior):
         solver = "full" if len(flat) <= flat.shape[1] else "covariance_eigh"
         pca = PCA(n_components=kept, svd_solver=solver).fit(normalised)
         latent = normalised @ pca.components_.T
-        covariance = shrunk_covariance(empirical_covariance(latent), shrinkage)
-        covariance += epsilon_covariance * np.eye(kept)
+        covariance = shrunk_covariance(empirical_covariance(latent), given.shrinkage)
+        covariance += given.epsilon_covariance * np.eye(kept)
 
         prior = cls(points=fields.shape[1], components=kept, **shape)
         for name, value in (
@@ -104,13 +82,13 @@ class PCAPrior(Prior):
             "explained_variance": pca.explained_variance_.tolist(),
             "explained_variance_ratio": pca.explained_variance_ratio_.tolist(),
         }
-        if kept < components:
-            prior.notes["components_requested"] = components
+        if kept < given.components:
+            prior.notes["components_requested"] = given.components
             log.warning(
                 "%d fields allow %d principal components; %d were asked for.",
                 len(flat),
                 kept,
-                components,
+                given.components,
             )
         return prior
 

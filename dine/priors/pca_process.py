@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dine.priors.base import PRIORS, check_fields
+from dine.config import GaussianProcessArguments, PCAProcessArguments
+from dine.priors.base import PRIORS, Sample
 from dine.priors.gaussian import LinearGaussian
-from dine.priors.gaussian_process import WIDTHS, Factor, GaussianProcessPrior
+from dine.priors.gaussian_process import Factor, GaussianProcessPrior
 from dine.priors.pca import PCAPrior
 from dine.priors.pca_residual import held_out_residuals
-from dine.priors.sources import SourceCache, check_sources, members, one_source, source_labels
+from dine.priors.sources import SourceCache, members, one_source, source_labels
 
 
 class _Pair(NamedTuple):
@@ -71,47 +72,19 @@ class PCAProcessPrior(PCAPrior):
         self._pairs: SourceCache[_Pair] = SourceCache()
 
     @classmethod
-    def fit(
-        cls,
-        fields: np.ndarray,
-        *,
-        seed: int = 0,
-        source: np.ndarray | None = None,
-        components: int = 64,
-        shrinkage: float = 0.05,
-        epsilon_std: float = 1e-6,
-        epsilon_covariance: float = 1e-3,
-        folds: int = 5,
-        widths: Sequence[float] = WIDTHS,
-        rank: int = 128,
-        points: int = 256,
-        sources: int = 64,
-        least_noise: float = 1e-3,
-    ) -> Self:
-        """Fit to (K, N, 3) fields of (K, N, 3) sources: the span to all, the process by folds.
+    def _fit(cls, sample: Sample, given: PCAProcessArguments) -> Self:
+        """The span of all fields, the process by folds.
 
         Fields of one source are held out together. The process is that of highest likelihood for
         what the components of the other folds miss, in the units of the fields. Where fewer than
         two fields can be held out, as with two fields altogether, no components are known, and it
-        is fitted to the fields about their mean.
-
-        ``notes["process"]`` are those of the process.
-
-        Args:
-            components: as for :class:`PCAPrior`, and so the next three.
-            folds: number of folds.
-            widths: as for the Gaussian process, and so the rest.
-
-        Raises:
-            ConfigError: no sources.
-            DataError: fewer than two fields, a bad shape, or fields that are all equal.
+        is fitted to the fields about their mean. ``notes["process"]`` are those of the process.
         """
-        fields = check_fields(fields)
-        source = check_sources(source, fields, cls.registered_name)
-        span = (components, shrinkage, epsilon_std, epsilon_covariance)
-        prior = cls._of_span(fields, *span, widths=widths, rank=rank)
+        fields = sample.fields
+        labels = source_labels(sample.source, len(fields))
+        prior = cls._of_span(fields, given, widths=given.widths, rank=given.rank)
         missed = list(
-            held_out_residuals(fields, components, source_labels(source, len(fields)), folds, seed)
+            held_out_residuals(fields, given.components, labels, given.folds, sample.seed)
         )
         rows = np.concatenate([np.zeros(0, int), *(part.rows for part in missed)])
         if len(rows) < 2:
@@ -119,23 +92,20 @@ class PCAProcessPrior(PCAPrior):
         else:
             standard = np.concatenate([part.residual for part in missed])
             residual = fields.std(axis=0) * standard.reshape(-1, *fields.shape[1:])
-        prior._fit_process(
-            residual, source[rows], seed=seed, points=points, sources=sources, noise=least_noise
-        )
-        return prior.freeze()
+        prior._fit_process(Sample(residual, sample.source[rows], sample.seed), given)
+        return prior
 
-    def _fit_process(
-        self, residual: np.ndarray, source: np.ndarray, *, noise: float, **arguments: Any
-    ) -> None:
-        if residual.any():
+    def _fit_process(self, missed: Sample, given: PCAProcessArguments) -> None:
+        if missed.fields.any():
+            own = given.model_dump(include=set(GaussianProcessArguments.model_fields))
             self.process = GaussianProcessPrior.fit(
-                residual, source=source, least_noise=noise, **self.process.shape, **arguments
+                missed.fields, source=missed.source, seed=missed.seed, **own
             )
             self.notes["process"] = self.process.notes
         else:  # nothing is missed: only the least noise is left
             self.process.amplitudes.zero_()
             self.process.affine.zero_()
-            self.process.noise.fill_(noise)
+            self.process.noise.fill_(given.least_noise)
 
     def _pair(self, points: np.ndarray, valid: np.ndarray | None, like: Tensor) -> _Pair:
         """Both parts at points (n, 3), those at ``valid`` (N,) of the source."""

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dine.priors.base import PRIORS, check_fields
+from dine.config import PCAResidualArguments
+from dine.priors.base import PRIORS, Sample
 from dine.priors.gaussian import LinearGaussian
 from dine.priors.pca import PCAPrior
-from dine.priors.sources import check_sources, held_out_folds, source_labels
+from dine.priors.sources import held_out_folds, source_labels
 
 LEAST_VARIANCE = 1e-4
 """Smallest σ²: a hundredth of each coordinate's standard deviation, squared."""
@@ -89,35 +90,18 @@ class PCAResidualPrior(PCAPrior):
         self.register_buffer("variance", torch.ones(()))
 
     @classmethod
-    def fit(
-        cls,
-        fields: np.ndarray,
-        *,
-        seed: int = 0,
-        source: np.ndarray | None = None,
-        components: int = 64,
-        shrinkage: float = 0.05,
-        epsilon_std: float = 1e-6,
-        epsilon_covariance: float = 1e-3,
-        folds: int = 5,
-    ) -> Self:
-        """Fit to (K, N, 3) fields: the span to all of them, σ² by cross-validation.
+    def _fit(cls, sample: Sample, given: PCAResidualArguments) -> Self:
+        """The span of all fields, σ² by cross-validation.
 
-        Where the sources (K, N, 3) are given, fields of one source are held out together.
+        Where the sources are given, fields of one source are held out together.
         ``notes["residual_variance"]`` has σ² before it is kept from falling below
         ``LEAST_VARIANCE``, and ``notes["residual_variance_in_sample"]`` what it would be without
         cross-validation.
-
-        Raises:
-            DataError: fewer than two fields, a bad shape, or fields that are all equal.
         """
-        fields = check_fields(fields)
-        if source is not None:
-            source = check_sources(source, fields, cls.registered_name)
-        span = (components, shrinkage, epsilon_std, epsilon_covariance)
-        prior = cls._of_span(fields, *span)
-        prior._fit_residual(fields, source_labels(source, len(fields)), folds, seed)
-        return prior.freeze()
+        prior = cls._of_span(sample.fields, given)
+        labels = source_labels(sample.source, len(sample.fields))
+        prior._fit_residual(sample.fields, labels, given.folds, sample.seed)
+        return prior
 
     def _fit_residual(self, fields: np.ndarray, labels: np.ndarray, folds: int, seed: int) -> None:
         found = residual_variance(fields, self.shape["components"], labels, folds, seed)

@@ -10,11 +10,12 @@ import torch
 from scipy.linalg import eigh
 from torch import Tensor
 
+from dine.config import SmoothnessArguments
 from dine.errors import ConfigError, DataError
 from dine.geometry.graph import neighbour_graph
-from dine.priors.base import PRIORS, Prior, check_fields, check_sizes
+from dine.priors.base import PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian
-from dine.priors.sources import SourceCache, check_sources, members, one_source, source_labels
+from dine.priors.sources import SourceCache, members, one_source, source_labels
 
 TYPICAL = 64.0
 """The penalty's mean over the fields of the fit: what 64 principal components cost."""
@@ -87,28 +88,11 @@ class SmoothnessPrior(Prior):
         self._graphs: SourceCache[_Edges] = SourceCache()
 
     @classmethod
-    def fit(
-        cls,
-        fields: np.ndarray,
-        *,
-        seed: int = 0,
-        source: np.ndarray | None = None,
-        neighbours: int = 10,
-        anchor: float = 0.01,
-    ) -> Self:
-        """The scale of (K, N, 3) fields of (K, N, 3) sources; nothing depends on ``seed``.
-
-        Args:
-            neighbours: nearest neighbours of each point in the graph.
-            anchor: w, between 0 and 1.
-
-        Raises:
-            ConfigError: no sources.
-            DataError: fewer than two fields, a bad shape, or fields that only translate.
-        """
-        fields = check_fields(fields)
-        source = check_sources(source, fields, cls.registered_name)
-        prior = cls(neighbours=neighbours, anchor=anchor)
+    def _fit(cls, sample: Sample, given: SmoothnessArguments) -> Self:
+        """The scale of the fields; those that only translate are refused."""
+        fields, source, _ = sample
+        neighbours = given.neighbours
+        prior = cls(neighbours=neighbours, anchor=given.anchor)
         labels = source_labels(source, len(fields))
         exact = torch.zeros((), dtype=torch.float64)
         roughness = np.zeros(len(fields))
@@ -129,7 +113,7 @@ class SmoothnessPrior(Prior):
             "roughness": float(roughness.mean()),
             "magnitude": float(magnitude.mean()),
         }
-        return prior.freeze()
+        return prior
 
     def _graph(self, points: np.ndarray, like: Tensor) -> _Edges:
         neighbours = self.shape["neighbours"]

@@ -29,7 +29,7 @@ class Run:
     def __init__(self, results: Path, config: Config):
         self.files = Results(results)
         self.config = config
-        self.metrics = load_metrics(self.files.run(*run, "metrics.csv") for run in runs(config))
+        self.metrics = load_metrics(self.files.run(*run).metrics for run in runs(config))
         typical = "the median Stage-1 case at the largest level, coloured by error"
         errors = "distribution of per-point squared distances, clean targets"
         self._kinds = [
@@ -48,31 +48,31 @@ class Run:
 
     def _per_method(self, dataset: str, backbone: str, file: str) -> dict[str, Path]:
         return {
-            method: self.files.run(dataset, backbone, method, file)
+            method: getattr(self.files.run(dataset, backbone, method), file)
             for method in self.config.methods(backbone)
         }
 
     def qualitative(self, dataset: str, backbone: str) -> Figure:
-        pairs = read_pairs(self.files.dataset(dataset, "pairs.h5"), split="test")
+        pairs = read_pairs(self.files.data(dataset).pairs, split="test")
         examples = draw.load_examples(
             draw.pick_examples(dataset, backbone, self.metrics),
             pairs,
-            self._per_method(dataset, backbone, "predictions.h5"),
-            self._per_method(dataset, backbone, "point_errors.h5"),
+            self._per_method(dataset, backbone, "predictions"),
+            self._per_method(dataset, backbone, "point_errors"),
         )
         return draw.qualitative_figure(examples, _title(dataset, backbone), self.origin(dataset))
 
     def histogram(self, dataset: str, backbone: str) -> Figure:
         errors = {
             method: draw.read_group(path, CLEAN, "squared_distance")[1]
-            for method, path in self._per_method(dataset, backbone, "point_errors.h5").items()
+            for method, path in self._per_method(dataset, backbone, "point_errors").items()
         }
         title = f"{_title(dataset, backbone)}: per-point error, all levels"
         return draw.histogram_figure(errors, title, self.origin(dataset))
 
     def training(self, dataset: str, backbone: str) -> Figure:
         histories = {}
-        for method, path in self._per_method(dataset, backbone, "history.csv").items():
+        for method, path in self._per_method(dataset, backbone, "history").items():
             frame = pd.read_csv(path)
             noisy = ["loss", "data", "penalty", "grad_norm"]
             frame[noisy] = frame[noisy].rolling(HISTORY_WINDOW, min_periods=1).mean()
@@ -90,7 +90,7 @@ class Run:
 
     def modes(self, dataset: str, backbone: str, name: str) -> Figure:
         prior = self._pca(dataset, backbone, name)
-        source = read_pairs(self.files.dataset(dataset, "pairs.h5"), split="test").source[0]
+        source = read_pairs(self.files.data(dataset).pairs, split="test").source[0]
         return draw.pca_modes_figure(
             prior.mean.numpy().reshape(-1, 3),
             prior.modes(),

@@ -59,12 +59,12 @@ def build_report(results: Path, config: Config, out: Path) -> None:
     """
     run = Run(results, config)
     agreement = [
-        {"dataset": display_name(dataset)} | read_json(run.files.dataset(dataset, "agreement.json"))
+        {"dataset": display_name(dataset)} | read_json(run.files.data(dataset).agreement)
         for dataset in config.datasets
     ]
     pictures: dict[str, list[tuple[str, Picture]]] = {}
     for name, (section, caption, _) in run.all_figures().items():
-        png = results / "figures" / f"{name}.png"
+        png = run.files.figure(name, "png")
         pictures.setdefault(section, []).append((name, Picture(caption, png)))
     searches = [read_json(path) for path in run.searches().values()]
     chosen = [picture for _, picture in pictures.pop("Choice of λ", [])]
@@ -147,7 +147,7 @@ def agreement_section(agreement: Sequence[Mapping[str, Any]]) -> Section:
 def _made(run: Run, config: Config) -> list[Item | None]:
     seconds, made = {}, {}
     for dataset, backbone, method in runs(config):
-        record = read_json(run.files.run(dataset, backbone, method, "run.json"))
+        record = read_json(run.files.run(dataset, backbone, method).record)
         made = record.get("made", made)
         stage = "Stage 1" if method == STAGE1 else "Stage 2"
         label = ", ".join([stage, *map(display_name, (dataset, backbone, method))])

@@ -31,6 +31,7 @@ from dine.models.backbones import Backbone
 from dine.models.devices import chosen_device, leased
 from dine.models.state import Interrupted, StopRequest, load_state, one_writer, save_state
 from dine.progress import Progress
+from dine.results import Network
 from dine.training.objective import Loss, Objective
 from dine.training.parallel import Alone, Team, run_together
 
@@ -237,7 +238,7 @@ def _train(
                     "history": history,
                 },
             )
-            write_text(folder / "history.csv", history_csv(history))
+            write_text(Network(folder).history, history_csv(history))
 
         saved = time.monotonic()
         elapsed = history[-1]["seconds"] if history else 0.0

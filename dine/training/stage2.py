@@ -12,6 +12,7 @@ from dine.files import file_digest, read_json, write_json
 from dine.models.checkpoint import load_backbone
 from dine.models.inference import COMPUTE
 from dine.priors import load_prior
+from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import VALIDATION_COLUMNS
 from dine.training.objective import Objective
@@ -117,7 +118,7 @@ def search_lambda(
             name=f"search of λ: {prior} {weight:g}",
             compute=compute,
         )
-        final = read_json(here / "run.json")["final"]
+        final = read_json(Network(here).record)["final"]
         return {name.removeprefix("val_"): final[name] for name in VALIDATION_COLUMNS}
 
     control = errors(CONTROL, 0.0)

@@ -19,6 +19,7 @@ from dine.models.devices import chosen_device
 from dine.models.inference import COMPUTE
 from dine.models.state import check_still_wanted
 from dine.provenance import code_digest, run_record
+from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import history_csv, train
 from dine.training.objective import Objective
@@ -131,11 +132,12 @@ def run(
         processes=compute.processes,
     )
     check_still_wanted(out / "training", identity, name)
+    made = Network(out)
     # Weights carry nothing that differs between two equal runs, so they can be compared by bytes.
-    save_backbone(out / "model.safetensors", backbone, name=name, seed=seed, steps=settings.steps)
-    write_text(out / "history.csv", history_csv(history))
+    save_backbone(made.model, backbone, name=name, seed=seed, steps=settings.steps)
+    write_text(made.history, history_csv(history))
     write_json(
-        out / "run.json",
+        made.record,
         run_record(
             settings.model_dump(),
             seed,

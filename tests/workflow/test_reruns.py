@@ -110,6 +110,8 @@ CODE = {
     "dine/priors/flow.py": Counter(),
     "dine/registration/view.py": Counter(),
     "code/my_package/data.py": Counter(),
+    # Used by all.
+    "dine/files.py": ALL + DATA + Counter(raw=1),
 }
 
 
@@ -126,14 +128,14 @@ def with_setting(keys, value):
     return edit
 
 
-def with_code(name):
+def with_code(name, added="\nADDED = 1\n"):
     def edit(place: Workplace):
         if name.startswith("dine/"):
             place.package = place.folder / "package"
             ignored = shutil.ignore_patterns("__pycache__", "weights")
             shutil.copytree(ROOT / "dine", place.package / "dine", ignore=ignored)
         path = (place.package if name.startswith("dine/") else place.folder) / name
-        path.write_text(path.read_text() + "\n")
+        path.write_text(path.read_text() + added)
 
     return edit
 
@@ -150,6 +152,7 @@ EDITS = {name: (with_setting(*edit), CONFIG + jobs) for name, (*edit, jobs) in S
 EDITS |= {name: (with_code(name), jobs) for name, jobs in CODE.items()}
 EDITS |= {
     "nothing": (lambda place: None, Counter()),
+    "a remark in code": (with_code("dine/geometry/graph.py", "\n# A remark.\n"), Counter()),
     "a touched mesh": (touched_mesh, ALL + DATA + Counter(raw=1)),
     "a lost table of metrics": (
         without("eggs/affine/stage2/vectors/metrics.csv"),

@@ -34,7 +34,7 @@ class Workplace:
         self.configs = [Path(path.name) for path in configs]
         for name in ("Snakefile", "config.yaml"):
             shutil.copy(ROOT / name, folder)
-        for name in ("workflow", "profiles"):
+        for name in ("workflow", "config", "profiles"):
             shutil.copytree(ROOT / name, folder / name)
         for path in configs:
             shutil.copy(path, folder)

@@ -3,20 +3,20 @@
 
 rule raw:
     output:
-        raw=RESULTS / "{dataset}" / "raw.json",
-        inventory=RESULTS / "{dataset}" / "inventory.csv",
-        left_out=RESULTS / "{dataset}" / "left_out.csv",
+        raw=DATA.raw,
+        inventory=DATA.inventory,
+        left_out=DATA.left_out,
     log:
-        LOGS / "{dataset}" / "raw.log",
+        FILES.log("{dataset}", "raw"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "raw.tsv"
+        FILES.benchmark("{dataset}", "raw")
     conda:
         "../envs/dine.yaml"
     resources:
         **request("data"),
     params:
-        settings=raw_settings,
-        signature=raw_signature,
+        settings=lambda wildcards: PLAN.raw(wildcards.dataset),
+        signature=lambda wildcards: PLAN.raw_signature(wildcards.dataset),
         first=0,
         seed=CONFIG.seed,
         code=code_digest("raw"),
@@ -28,16 +28,16 @@ rule raw:
 # Further objects, which nothing is trained on.
 use rule raw as raw_unseen with:
     output:
-        raw=RESULTS / "{dataset}" / "unseen" / "raw.json",
-        inventory=RESULTS / "{dataset}" / "unseen" / "inventory.csv",
-        left_out=RESULTS / "{dataset}" / "unseen" / "left_out.csv",
+        raw=FILES.unseen("{dataset}").raw,
+        inventory=FILES.unseen("{dataset}").inventory,
+        left_out=FILES.unseen("{dataset}").left_out,
     log:
-        LOGS / "{dataset}" / "raw_unseen.log",
+        FILES.log("{dataset}", "raw_unseen"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "raw_unseen.tsv"
+        FILES.benchmark("{dataset}", "raw_unseen")
     params:
-        settings=unseen_settings,
-        signature=unseen_signature,
+        settings=lambda wildcards: PLAN.unseen(wildcards.dataset),
+        signature=lambda wildcards: PLAN.unseen_signature(wildcards.dataset),
         first=lambda wildcards: CONFIG.datasets[wildcards.dataset].recipe.objects,
         seed=CONFIG.seed,
         code=code_digest("raw"),
@@ -45,24 +45,24 @@ use rule raw as raw_unseen with:
 
 rule pairs:
     input:
-        unpack(raw_files),
+        unpack(lambda wildcards: PLAN.raw_files(wildcards.dataset)),
     output:
-        RESULTS / "{dataset}" / "pairs.h5",
+        DATA.pairs,
     log:
-        LOGS / "{dataset}" / "pairs.log",
+        FILES.log("{dataset}", "pairs"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "pairs.tsv"
+        FILES.benchmark("{dataset}", "pairs")
     conda:
         "../envs/dine.yaml"
     resources:
         **request("data"),
     params:
-        unseen=unseen_option,
+        more=lambda wildcards, input: options("--unseen", input[1:]),
         settings=lambda wildcards: section(CONFIG.datasets[wildcards.dataset].pairs),
         seed=CONFIG.seed,
         code=code_digest("pairs"),
     shell:
-        "dine --log {log:q} pairs --raw {input.raw:q} {params.unseen}"
+        "dine --log {log:q} pairs --raw {input.raw:q} {params.more}"
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
 
 
@@ -70,11 +70,11 @@ rule agreement:
     input:
         rules.pairs.output,
     output:
-        RESULTS / "{dataset}" / "agreement.json",
+        DATA.agreement,
     log:
-        LOGS / "{dataset}" / "agreement.log",
+        FILES.log("{dataset}", "agreement"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "agreement.tsv"
+        FILES.benchmark("{dataset}", "agreement")
     conda:
         "../envs/dine.yaml"
     resources:
@@ -90,45 +90,43 @@ rule corrupt:
     input:
         rules.pairs.output,
     output:
-        RESULTS / "{dataset}" / "variants" / "{condition}_{corruption}.h5",
+        DATA.variant("{condition}", "{corruption}"),
     log:
-        LOGS / "{dataset}" / "variants" / "{condition}_{corruption}.log",
+        FILES.log("{dataset}", "variants", "{condition}_{corruption}"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "variants" / "{condition}_{corruption}.tsv"
-    wildcard_constraints:
-        condition="noise|outliers",
+        FILES.benchmark("{dataset}", "variants", "{condition}_{corruption}")
     conda:
         "../envs/dine.yaml"
     resources:
         **request("data"),
     params:
-        most=most_option,
+        some=lambda wildcards: options("--most", PLAN.most_corrupted(wildcards.dataset)),
         seed=CONFIG.seed,
         code=code_digest("corrupt"),
     shell:
         "dine --log {log:q} corrupt --pairs {input:q} --condition {wildcards.condition}"
-        " --level {wildcards.corruption} {params.most} --seed {params.seed} --out {output:q}"
+        " --level {wildcards.corruption} {params.some} --seed {params.seed} --out {output:q}"
 
 
 rule resample:
     input:
-        unpack(raw_files),
+        raws=lambda wildcards: [*PLAN.raw_files(wildcards.dataset).values()],
         pairs=rules.pairs.output,
     output:
-        RESULTS / "{dataset}" / "variants" / "resampled_1.h5",
+        DATA.variant("resampled", 1),
     log:
-        LOGS / "{dataset}" / "variants" / "resampled_1.log",
+        FILES.log("{dataset}", "variants", "resampled_1"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "variants" / "resampled_1.tsv"
+        FILES.benchmark("{dataset}", "variants", "resampled_1")
     conda:
         "../envs/dine.yaml"
     resources:
         **request("data"),
     params:
-        raws=raw_options,
-        most=most_option,
+        raws=lambda wildcards, input: options("--raw", input.raws),
+        some=lambda wildcards: options("--most", PLAN.most_corrupted(wildcards.dataset)),
         seed=CONFIG.seed,
         code=code_digest("resample"),
     shell:
         "dine --log {log:q} resample {params.raws} --pairs {input.pairs:q}"
-        " {params.most} --seed {params.seed} --out {output:q}"
+        " {params.some} --seed {params.seed} --out {output:q}"

@@ -3,50 +3,50 @@
 
 rule predict:
     input:
-        model=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "model.safetensors",
+        model=NETWORK.model,
         pairs=rules.pairs.output,
-        variants=variant_files,
+        variants=lambda wildcards: PLAN.variants(wildcards.dataset),
     output:
-        RESULTS / "{dataset}" / "{backbone}" / "{run}" / "predictions.h5",
+        NETWORK.predictions,
     log:
-        LOGS / "{dataset}" / "{backbone}" / "{run}" / "predict.log",
+        FILES.log("{dataset}", "{backbone}", "{run}", "predict"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "{run}" / "predict.tsv"
+        FILES.benchmark("{dataset}", "{backbone}", "{run}", "predict")
     conda:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
         **request("prediction"),
     params:
-        variants=variant_options,
+        variants=lambda wildcards, input: options("--variant", input.variants),
+        name="{dataset}/{backbone}/{run}",
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=lambda wildcards: code_of("predict", wildcards.backbone),
+        code=lambda wildcards: PLAN.code("predict", wildcards.backbone),
     shell:
         "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
         " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
-        " {params.compute}"
-        " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.run}' --out {output:q}"
+        " {params.compute} --name '{params.name}' --out {output:q}"
 
 
 rule evaluate:
     input:
         predictions=rules.predict.output,
         pairs=rules.pairs.output,
-        variants=variant_files,
+        variants=lambda wildcards: PLAN.variants(wildcards.dataset),
     output:
-        metrics=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "metrics.csv",
-        point_errors=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "point_errors.h5",
+        metrics=NETWORK.metrics,
+        point_errors=NETWORK.point_errors,
     log:
-        LOGS / "{dataset}" / "{backbone}" / "{run}" / "evaluate.log",
+        FILES.log("{dataset}", "{backbone}", "{run}", "evaluate"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "{run}" / "evaluate.tsv"
+        FILES.benchmark("{dataset}", "{backbone}", "{run}", "evaluate")
     conda:
         "../envs/dine.yaml"
     resources:
         **request("evaluation"),
     params:
-        variants=variant_options,
+        variants=lambda wildcards, input: options("--variant", input.variants),
         method=lambda wildcards: wildcards.run.removeprefix("stage2/"),
         seed=CONFIG.seed,
         code=code_digest("evaluate"),

@@ -2,11 +2,8 @@
 # Stage 1, the control and the priors of `all` are trained again with every seed; then the methods
 # of the configuration, and all of them are evaluated on objects that nothing else has seen.
 
-EVIDENCE = RESULTS / "evidence"
-EVIDENCE_LOGS = LOGS / "evidence"
-EVIDENCE_BENCHMARKS = BENCHMARKS / "evidence"
-# Other numbers than those of any dataset or of the pretraining.
-FIRST_TEST_OBJECT = 2_000_000
+TESTED = EVIDENCE.data("{dataset}")
+REFINED = EVIDENCE.cell("{dataset}", "{cell_backbone}", "{seed}", "{refined}")
 
 
 wildcard_constraints:
@@ -24,215 +21,192 @@ wildcard_constraints:
     classical="|".join(evidence_names(CONFIG, dine_config.ClassicalMethod)) or NOTHING,
 
 
-rule evidence_raw:
+use rule raw as evidence_raw with:
     output:
-        EVIDENCE / "{dataset}" / "raw.json",
+        raw=TESTED.raw,
+        inventory=TESTED.inventory,
+        left_out=TESTED.left_out,
     log:
-        EVIDENCE_LOGS / "{dataset}" / "raw.log",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("evidence", "{dataset}", "raw"),
+    benchmark:
+        FILES.benchmark("evidence", "{dataset}", "raw")
     params:
-        settings=evidence_raw_settings,
-        signature=evidence_raw_signature,
+        settings=lambda wildcards: PLAN.test_raw(wildcards.dataset),
+        signature=lambda wildcards: PLAN.test_signature(wildcards.dataset),
         first=FIRST_TEST_OBJECT,
         seed=CONFIG.seed,
         code=code_digest("raw"),
-    shell:
-        "dine --log {log:q} raw --settings {params.settings:q} --first-object {params.first}"
-        ' --seed {params.seed} --out "$(dirname -- {output:q})"'
 
 
-rule evidence_pairs:
+use rule pairs as evidence_pairs with:
     input:
-        rules.evidence_raw.output,
+        raw=TESTED.raw,
     output:
-        EVIDENCE / "{dataset}" / "pairs.h5",
+        TESTED.pairs,
     log:
-        EVIDENCE_LOGS / "{dataset}" / "pairs.log",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("evidence", "{dataset}", "pairs"),
+    benchmark:
+        FILES.benchmark("evidence", "{dataset}", "pairs")
     params:
-        settings=evidence_pair_settings,
+        more="--test-only",
+        settings=lambda wildcards: PLAN.test_pairs(wildcards.dataset),
         seed=CONFIG.seed,
         code=code_digest("pairs"),
-    shell:
-        "dine --log {log:q} pairs --raw {input:q} --settings {params.settings:q} --test-only"
-        " --seed {params.seed} --out {output:q}"
 
 
-rule evidence_corrupt:
+use rule corrupt as evidence_corrupt with:
     input:
-        evidence_pairs_file,
+        lambda wildcards: PLAN.test_pairs_file(wildcards.dataset),
     output:
-        EVIDENCE / "{dataset}" / "variants" / "{condition}_{corruption}.h5",
+        TESTED.variant("{condition}", "{corruption}"),
     log:
-        EVIDENCE_LOGS / "{dataset}" / "variants" / "{condition}_{corruption}.log",
-    wildcard_constraints:
-        condition="noise|outliers",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("evidence", "{dataset}", "variants", "{condition}_{corruption}"),
+    benchmark:
+        FILES.benchmark("evidence", "{dataset}", "variants", "{condition}_{corruption}")
     params:
-        levels=evidence_levels,
+        some=lambda wildcards: options("--at", PLAN.test_levels(wildcards.dataset)),
         seed=CONFIG.seed,
         code=code_digest("corrupt"),
-    shell:
-        "dine --log {log:q} corrupt --pairs {input:q} --condition {wildcards.condition}"
-        " --level {wildcards.corruption} {params.levels} --seed {params.seed} --out {output:q}"
 
 
-rule evidence_resample:
+use rule resample as evidence_resample with:
     input:
-        pairs=evidence_pairs_file,
-        raws=evidence_raw_files,
+        raws=lambda wildcards: PLAN.test_raw_files(wildcards.dataset),
+        pairs=lambda wildcards: PLAN.test_pairs_file(wildcards.dataset),
     output:
-        EVIDENCE / "{dataset}" / "variants" / "resampled_1.h5",
+        TESTED.variant("resampled", 1),
     log:
-        EVIDENCE_LOGS / "{dataset}" / "variants" / "resampled_1.log",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("evidence", "{dataset}", "variants", "resampled_1"),
+    benchmark:
+        FILES.benchmark("evidence", "{dataset}", "variants", "resampled_1")
     params:
         raws=lambda wildcards, input: options("--raw", input.raws),
-        levels=evidence_levels,
+        some=lambda wildcards: options("--at", PLAN.test_levels(wildcards.dataset)),
         seed=CONFIG.seed,
         code=code_digest("resample"),
-    shell:
-        "dine --log {log:q} resample {params.raws} --pairs {input.pairs:q}"
-        " {params.levels} --seed {params.seed} --out {output:q}"
 
 
 # λ of every method of its own, on the dataset and backbone of `lambda_search`.
-rule evidence_lambda:
+use rule search_lambda as evidence_lambda with:
     input:
-        pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
-        model=FILES.run(SEARCH.dataset, SEARCH.backbone, "stage1", "model.safetensors"),
-        prior=searched_prior,
+        pairs=FILES.data(SEARCH.dataset).pairs,
+        model=FILES.run(SEARCH.dataset, SEARCH.backbone, "stage1").model,
+        priors=lambda wildcards: [PLAN.method_searched(wildcards.trained)],
     output:
-        EVIDENCE / "lambda" / "{trained}.json",
+        EVIDENCE.search("{trained}"),
     log:
-        EVIDENCE_LOGS / "lambda" / "{trained}.log",
+        FILES.log("evidence", "lambda", "{trained}"),
     benchmark:
-        EVIDENCE_BENCHMARKS / "lambda" / "{trained}.tsv"
-    priority: 40
-    conda:
-        "../envs/dine.yaml"
-    threads: THREADS * PROCESSES
-    resources:
-        **request("training"),
+        FILES.benchmark("evidence", "lambda", "{trained}")
     params:
-        stage2=method_stage2,
-        settings=evidence_search,
+        priors=lambda wildcards, input: options(
+            "--prior", [wildcards.trained], input.priors
+        ),
+        stage2=lambda wildcards: PLAN.method_stage2(wildcards.trained),
+        settings=lambda wildcards: PLAN.method_search(wildcards.trained),
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=searched_code,
-    shell:
-        "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
-        " --model {input.model:q} --prior {wildcards.trained} {input.prior:q}"
-        " --stage2 {params.stage2:q} --settings {params.settings:q} --seed {params.seed}"
-        " {params.compute} --processes {resources.processes} --out {output:q}"
+        code=lambda wildcards: PLAN.method_code(
+            wildcards.trained, "search-lambda", SEARCH.backbone
+        ),
 
 
-rule stage2_method:
+use rule stage2_control as stage2_method with:
     input:
-        unpack(method_inputs),
+        unpack(
+            lambda wildcards: PLAN.method_inputs(
+                wildcards.trained, wildcards.dataset, wildcards.backbone
+            )
+        ),
         pairs=rules.pairs.output,
         model=rules.stage1.output.model,
     output:
-        **stage2_outputs("{trained}"),
+        **trained(FILES.run("{dataset}", "{backbone}", "{trained}")),
     log:
-        LOGS / "{dataset}" / "{backbone}" / "stage2" / "{trained}.log",
+        FILES.log("{dataset}", "{backbone}", "stage2", "{trained}"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "{trained}.tsv"
-    conda:
-        "../envs/dine.yaml"
-    threads: THREADS * PROCESSES
-    resources:
-        **request("training"),
+        FILES.benchmark("{dataset}", "{backbone}", "stage2", "{trained}")
     params:
-        prior=method_prior_options,
-        settings=method_stage2,
-        seed=training_seed,
+        variant=lambda wildcards: wildcards.trained,
+        prior=lambda wildcards, input: method_options(wildcards.trained, input),
+        settings=lambda wildcards: PLAN.method_stage2(wildcards.trained),
+        seed=lambda wildcards: PLAN.seed(wildcards.backbone),
         compute=COMPUTE,
-        code=method_code,
-    shell:
-        "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
-        " --model {input.model:q} --variant {wildcards.trained} {params.prior}"
-        " --settings {params.settings:q} --seed {params.seed}"
-        " {params.compute} --processes {resources.processes}"
-        " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.trained}'"
-        ' --out "$(dirname -- {output.model:q})"'
+        code=lambda wildcards: PLAN.method_code(
+            wildcards.trained, "stage2", wildcards.backbone
+        ),
 
 
-rule evidence_predict:
+use rule predict as evidence_predict with:
     input:
-        model=evidence_model,
-        pairs=evidence_pairs_file,
-        variants=evidence_variants,
+        model=lambda wildcards: PLAN.model(
+            wildcards.dataset,
+            wildcards.cell_backbone,
+            int(wildcards.seed),
+            wildcards.network,
+        ),
+        pairs=lambda wildcards: PLAN.test_pairs_file(wildcards.dataset),
+        variants=lambda wildcards: PLAN.test_variants(wildcards.dataset),
     output:
-        EVIDENCE
-        / "{dataset}"
-        / "{cell_backbone}"
-        / "seed{seed}"
-        / "{network}"
-        / "predictions.h5",
+        EVIDENCE.cell("{dataset}", "{cell_backbone}", "{seed}", "{network}").predictions,
     log:
-        EVIDENCE_LOGS
-        / "{dataset}"
-        / "{cell_backbone}"
-        / "seed{seed}"
-        / "{network}_predict.log",
-    conda:
-        "../envs/dine.yaml"
-    threads: THREADS
-    resources:
-        **request("prediction"),
+        FILES.log(
+            "evidence",
+            "{dataset}",
+            "{cell_backbone}",
+            "seed{seed}",
+            "{network}_predict",
+        ),
+    benchmark:
+        FILES.benchmark(
+            "evidence",
+            "{dataset}",
+            "{cell_backbone}",
+            "seed{seed}",
+            "{network}_predict",
+        )
     params:
-        variants=variant_options,
+        variants=lambda wildcards, input: options("--variant", input.variants),
+        name="{dataset}/{cell_backbone}/seed{seed}/{network}",
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=lambda wildcards: code_of("predict", wildcards.cell_backbone),
-    shell:
-        "dine --log {log:q} --threads {threads} predict --model {input.model:q}"
-        " --pairs {input.pairs:q} {params.variants} --batch-size {params.batch}"
-        " {params.compute} --out {output:q} --name"
-        " '{wildcards.dataset}/{wildcards.cell_backbone}/seed{wildcards.seed}/{wildcards.network}'"
+        code=lambda wildcards: PLAN.code("predict", wildcards.cell_backbone),
 
 
 rule evidence_refine:
     input:
-        unpack(refined_inputs),
-        pairs=evidence_pairs_file,
-        variants=evidence_variants,
+        unpack(
+            lambda wildcards: PLAN.refined_inputs(
+                wildcards.refined,
+                wildcards.dataset,
+                wildcards.cell_backbone,
+                int(wildcards.seed),
+            )
+        ),
+        pairs=lambda wildcards: PLAN.test_pairs_file(wildcards.dataset),
+        variants=lambda wildcards: PLAN.test_variants(wildcards.dataset),
     output:
-        EVIDENCE
-        / "{dataset}"
-        / "{cell_backbone}"
-        / "seed{seed}"
-        / "{refined}"
-        / "predictions.h5",
+        REFINED.predictions,
     log:
-        EVIDENCE_LOGS
-        / "{dataset}"
-        / "{cell_backbone}"
-        / "seed{seed}"
-        / "{refined}_refine.log",
+        FILES.log(
+            "evidence",
+            "{dataset}",
+            "{cell_backbone}",
+            "seed{seed}",
+            "{refined}_refine",
+        ),
     conda:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
         **request("registration"),
     params:
-        variants=variant_options,
-        prior=refined_prior_options,
-        settings=lambda wildcards: section(CONFIG.evidence.methods[wildcards.refined]),
-        code=refined_code,
+        variants=lambda wildcards, input: options("--variant", input.variants),
+        prior=lambda wildcards, input: options(
+            "--prior", [path for name, path in input.items() if name == "prior"]
+        ),
+        settings=lambda wildcards: section(PLAN.method(wildcards.refined)),
+        code=lambda wildcards: PLAN.method_code(wildcards.refined, "refine-predictions"),
     shell:
         "dine --log {log:q} --threads {threads} refine-predictions"
         " --predictions {input.predictions:q} --pairs {input.pairs:q} {params.variants}"
@@ -242,27 +216,25 @@ rule evidence_refine:
 
 rule evidence_classical:
     input:
-        pairs=evidence_pairs_file,
-        variants=evidence_variants,
+        pairs=lambda wildcards: PLAN.test_pairs_file(wildcards.dataset),
+        variants=lambda wildcards: PLAN.test_variants(wildcards.dataset),
     output:
-        EVIDENCE / "{dataset}" / "none" / "seed0" / "{classical}" / "predictions.h5",
+        EVIDENCE.cell("{dataset}", NO_BACKBONE, 0, "{classical}").predictions,
     log:
-        EVIDENCE_LOGS / "{dataset}" / "none" / "seed0" / "{classical}_classical.log",
+        FILES.log(
+            "evidence", "{dataset}", NO_BACKBONE, "seed0", "{classical}_classical"
+        ),
     conda:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
         **request("registration"),
     params:
-        variants=variant_options,
-        algorithm=lambda wildcards: CONFIG.evidence.methods[
-            wildcards.classical
-        ].algorithm,
-        arguments=lambda wildcards: json.dumps(
-            CONFIG.evidence.methods[wildcards.classical].arguments, sort_keys=True
-        ),
+        variants=lambda wildcards, input: options("--variant", input.variants),
+        algorithm=lambda wildcards: PLAN.method(wildcards.classical).algorithm,
+        arguments=lambda wildcards: text(PLAN.method(wildcards.classical).arguments),
         code=lambda wildcards: code_digest(
-            "classical", CONFIG.evidence.methods[wildcards.classical].algorithm
+            "classical", PLAN.method(wildcards.classical).algorithm
         ),
     shell:
         "dine --log {log:q} --threads {threads} classical --pairs {input.pairs:q}"
@@ -273,24 +245,22 @@ rule evidence_classical:
 # One job for all methods of a network and seed, as starting a job takes longer than its share.
 rule evidence_evaluate:
     input:
-        predictions=lambda wildcards: cell_predictions(group_cells(wildcards)),
-        pairs=evidence_pairs_file,
-        variants=evidence_variants,
+        predictions=lambda wildcards: PLAN.predictions(group(wildcards)),
+        pairs=lambda wildcards: PLAN.test_pairs_file(wildcards.dataset),
+        variants=lambda wildcards: PLAN.test_variants(wildcards.dataset),
     output:
-        EVIDENCE / "{dataset}" / "{group}" / "seed{seed}" / "metrics.csv",
+        EVIDENCE.metrics("{dataset}", "{group}", "{seed}"),
     log:
-        EVIDENCE_LOGS / "{dataset}" / "{group}" / "seed{seed}" / "evaluate.log",
+        FILES.log("evidence", "{dataset}", "{group}", "seed{seed}", "evaluate"),
     wildcard_constraints:
-        group=f"none|{EVERY_BACKBONE}",
+        group=f"{NO_BACKBONE}|{EVERY_BACKBONE}",
     conda:
         "../envs/dine.yaml"
     resources:
         **request("evaluation"),
     params:
-        variants=variant_options,
-        runs=lambda wildcards, input: cell_options(
-            group_cells(wildcards), input.predictions
-        ),
+        variants=lambda wildcards, input: options("--variant", input.variants),
+        runs=lambda wildcards, input: cell_options(group(wildcards), input.predictions),
         code=code_digest("evaluate"),
     shell:
         "dine --log {log:q} evaluate {params.runs} --pairs {input.pairs:q}"
@@ -305,17 +275,17 @@ rule evidence_diagnose:
         fields=rules.fields.output,
         pairs=rules.pairs.output,
     output:
-        result=EVIDENCE / "diagnostics" / "{dataset}" / "{backbone}" / "{prior}.json",
-        samples=EVIDENCE / "diagnostics" / "{dataset}" / "{backbone}" / "{prior}.png",
+        result=EVIDENCE.diagnostics("{dataset}", "{backbone}", "{prior}"),
+        samples=EVIDENCE.diagnostics("{dataset}", "{backbone}", "{prior}", "png"),
     log:
-        EVIDENCE_LOGS / "diagnostics" / "{dataset}" / "{backbone}" / "{prior}.log",
+        FILES.log("evidence", "diagnostics", "{dataset}", "{backbone}", "{prior}"),
     conda:
         "../envs/dine.yaml"
     resources:
         **request("prior"),
     params:
         seed=CONFIG.seed,
-        code=lambda wildcards: code_of("diagnose", priors=[wildcards.prior]),
+        code=lambda wildcards: PLAN.code("diagnose", priors=[wildcards.prior]),
     shell:
         "dine --log {log:q} diagnose --prior {input.prior:q} --fields {input.fields:q}"
         " --pairs {input.pairs:q} --dataset {wildcards.dataset} --backbone {wildcards.backbone}"
@@ -324,24 +294,26 @@ rule evidence_diagnose:
 
 rule evidence_examples:
     input:
-        predictions=lambda wildcards: cell_predictions(example_cells(wildcards.dataset)),
-        pairs=evidence_pairs_file,
-        variants=evidence_variants,
+        predictions=lambda wildcards: PLAN.predictions(
+            PLAN.example_cells(wildcards.dataset)
+        ),
+        pairs=lambda wildcards: PLAN.test_pairs_file(wildcards.dataset),
+        variants=lambda wildcards: PLAN.test_variants(wildcards.dataset),
     output:
-        views=EVIDENCE / "{dataset}" / "examples.png",
-        print=EVIDENCE / "{dataset}" / "examples.pdf",
+        views=EVIDENCE.examples("{dataset}"),
+        print=EVIDENCE.examples("{dataset}", "pdf"),
     log:
-        EVIDENCE_LOGS / "{dataset}" / "examples.log",
+        FILES.log("evidence", "{dataset}", "examples"),
     conda:
         "../envs/dine.yaml"
     resources:
         **request("reporting"),
     params:
-        variants=variant_options,
+        variants=lambda wildcards, input: options("--variant", input.variants),
         runs=lambda wildcards, input: cell_options(
-            example_cells(wildcards.dataset), input.predictions
+            PLAN.example_cells(wildcards.dataset), input.predictions
         ),
-        methods=evidence_method_texts(),
+        methods=PLAN.method_texts(),
         code=code_digest("examples"),
     shell:
         "dine --log {log:q} examples {params.runs} --pairs {input.pairs:q} {params.variants}"
@@ -350,19 +322,19 @@ rule evidence_examples:
 
 rule evidence:
     input:
-        examples=evidence_examples(),
-        metrics=evidence_metrics(),
-        searches=evidence_searches(),
-        diagnostics=evidence_diagnostics(),
-        kept=evidence_kept(),
+        examples=list(PLAN.examples().values()),
+        metrics=PLAN.metrics(),
+        searches=PLAN.all_searches(),
+        diagnostics=[EVIDENCE.diagnostics(*prior) for prior in PLAN.diagnosed()],
+        kept=PLAN.evidence_kept(),
     output:
         report(
-            EVIDENCE / "report.html",
+            EVIDENCE.report,
             caption="../report/evidence.rst",
             category="Evidence",
         ),
     log:
-        EVIDENCE_LOGS / "report.log",
+        FILES.log("evidence", "report"),
     conda:
         "../envs/dine.yaml"
     resources:
@@ -370,9 +342,11 @@ rule evidence:
     params:
         searches=lambda wildcards, input: options("--search", input.searches),
         diagnostics=lambda wildcards, input: options("--diagnostics", input.diagnostics),
-        examples=evidence_example_options,
-        methods=evidence_method_texts(),
-        settings=whole_config(),
+        examples=lambda wildcards, input: options(
+            "--example", PLAN.examples(), input.examples, EXAMPLE_TEXTS
+        ),
+        methods=PLAN.method_texts(),
+        settings=PLAN.whole,
         code=code_digest("evidence"),
     shell:
         "dine --log {log:q} evidence {input.metrics:q} {params.searches} {params.diagnostics}"

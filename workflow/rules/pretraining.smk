@@ -1,104 +1,72 @@
 # Weights of our own to start Stage 1 from; `snakemake -j2 pretrained`. Not part of `all`.
 
-PRETRAINING = RESULTS / "pretraining"
-# Far beyond the numbers that any dataset uses, so that no object is trained on and tested on.
-FIRST_OBJECT = 1_000_000
-# Somewhat harder than the default datasets.
-AMPLITUDE = 0.15
-LEVELS = {
-    "primitives": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8],
-    "tissue": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7],
-}
+SHAPES = PLAN.pretraining_shapes
+SHAPE = FILES.pretraining_data("{shape}")
+PRETRAINED = FILES.pretrained("{backbone}")
+SHAPES_DATA = [FILES.pretraining_data(shape) for shape in SHAPES]
 
 
-rule pretraining_raw:
+use rule raw as pretraining_raw with:
     output:
-        PRETRAINING / "{shape}" / "raw.json",
+        raw=SHAPE.raw,
+        inventory=SHAPE.inventory,
+        left_out=SHAPE.left_out,
     log:
-        LOGS / "pretraining" / "{shape}_raw.log",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("pretraining", "{shape}_raw"),
+    benchmark:
+        FILES.benchmark("pretraining", "{shape}_raw")
     params:
-        settings=lambda wildcards: json.dumps(
-            {
-                "recipe": {
-                    "shape": wildcards.shape,
-                    "objects": CONFIG.pretraining.objects // 2,
-                    "levels": LEVELS[wildcards.shape],
-                    "amplitude": AMPLITUDE,
-                }
-            },
-            sort_keys=True,
-        ),
-        first=FIRST_OBJECT,
+        settings=lambda wildcards: PLAN.pretraining_raw(wildcards.shape),
+        signature="",
+        first=FIRST_PRETRAINING_OBJECT,
         seed=CONFIG.seed,
         code=code_digest("raw"),
-    shell:
-        "dine --log {log:q} raw --settings {params.settings:q} --first-object {params.first}"
-        ' --seed {params.seed} --out "$(dirname -- {output:q})"'
 
 
-rule pretraining_pairs:
+use rule pairs as pretraining_pairs with:
     input:
-        rules.pretraining_raw.output,
+        raw=SHAPE.raw,
     output:
-        PRETRAINING / "{shape}" / "pairs.h5",
+        SHAPE.pairs,
     log:
-        LOGS / "pretraining" / "{shape}_pairs.log",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("pretraining", "{shape}_pairs"),
+    benchmark:
+        FILES.benchmark("pretraining", "{shape}_pairs")
     params:
-        settings=lambda wildcards: json.dumps(
-            {
-                "convention": "sphere",  # one for both shapes, as one prior is fitted to both
-                "split": {"train": 0.9, "val": 0.05, "test": 0.05},
-            },
-            sort_keys=True,
-        ),
+        more="",
+        settings=PLAN.pretraining_pairs,
         seed=CONFIG.seed,
         code=code_digest("pairs"),
-    shell:
-        "dine --log {log:q} pairs --raw {input:q} --settings {params.settings:q}"
-        " --seed {params.seed} --out {output:q}"
 
 
 # Two scans share no points: half of what is trained on has targets of other points, too.
-rule pretraining_targets:
+use rule resample as pretraining_targets with:
     input:
-        raw=rules.pretraining_raw.output,
-        pairs=rules.pretraining_pairs.output,
+        raws=[SHAPE.raw],
+        pairs=SHAPE.pairs,
     output:
-        PRETRAINING / "{shape}" / "resampled.h5",
+        SHAPE.resampled,
     log:
-        LOGS / "pretraining" / "{shape}_targets.log",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("pretraining", "{shape}_targets"),
+    benchmark:
+        FILES.benchmark("pretraining", "{shape}_targets")
     params:
+        raws=lambda wildcards, input: options("--raw", input.raws),
+        some="",
         seed=CONFIG.seed,
         code=code_digest("resample"),
-    shell:
-        "dine --log {log:q} resample --raw {input.raw:q} --pairs {input.pairs:q}"
-        " --seed {params.seed} --out {output:q}"
 
 
 rule pretrain:
     input:
-        pairs=expand(PRETRAINING / "{shape}" / "pairs.h5", shape=LEVELS),
-        targets=expand(PRETRAINING / "{shape}" / "resampled.h5", shape=LEVELS),
+        pairs=[data.pairs for data in SHAPES_DATA],
+        targets=[data.resampled for data in SHAPES_DATA],
     output:
-        model=PRETRAINING / "{backbone}" / "model.safetensors",
-        history=PRETRAINING / "{backbone}" / "history.csv",
-        record=PRETRAINING / "{backbone}" / "run.json",
+        **trained(PRETRAINED),
     log:
-        LOGS / "pretraining" / "{backbone}.log",
+        FILES.log("pretraining", "{backbone}"),
     benchmark:
-        BENCHMARKS / "pretraining" / "{backbone}.tsv"
+        FILES.benchmark("pretraining", "{backbone}")
     conda:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
@@ -107,11 +75,11 @@ rule pretrain:
     params:
         pairs=lambda wildcards, input: options("--pairs", input.pairs),
         targets=lambda wildcards, input: options("--targets", input.targets),
-        backbone=backbone_settings,
+        backbone=lambda wildcards: PLAN.network(wildcards.backbone),
         settings=section(CONFIG.pretraining),
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=lambda wildcards: code_of(
+        code=lambda wildcards: PLAN.code(
             "pretrain", wildcards.backbone, data_term=CONFIG.pretraining.data_term
         ),
     shell:
@@ -126,13 +94,13 @@ rule pretrain:
 
 rule pretraining_fields:
     input:
-        model=rules.pretrain.output.model,
-        pairs=rules.pretraining_pairs.output,
-        targets=rules.pretraining_targets.output,
+        model=PRETRAINED.model,
+        pairs=SHAPE.pairs,
+        targets=SHAPE.resampled,
     output:
-        PRETRAINING / "{backbone}" / "fields_{shape}.h5",
+        FILES.pretraining_fields("{backbone}", "{shape}"),
     log:
-        LOGS / "pretraining" / "{backbone}_fields_{shape}.log",
+        FILES.log("pretraining", "{backbone}_fields_{shape}"),
     conda:
         "../envs/dine.yaml"
     threads: THREADS
@@ -140,7 +108,7 @@ rule pretraining_fields:
         **request("prediction"),
     params:
         compute=COMPUTE,
-        code=lambda wildcards: code_of("fields", wildcards.backbone),
+        code=lambda wildcards: PLAN.code("fields", wildcards.backbone),
     shell:
         "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
         " --pairs {input.pairs:q} --targets {input.targets:q} {params.compute}"
@@ -149,15 +117,11 @@ rule pretraining_fields:
 
 rule pretraining_prior:
     input:
-        expand(
-            PRETRAINING / "{backbone}" / "fields_{shape}.h5",
-            shape=LEVELS,
-            allow_missing=True,
-        ),
+        [FILES.pretraining_fields("{backbone}", shape) for shape in SHAPES],
     output:
-        PRETRAINING / "{backbone}" / "prior.safetensors",
+        PRETRAINED.prior,
     log:
-        LOGS / "pretraining" / "{backbone}_prior.log",
+        FILES.log("pretraining", "{backbone}_prior"),
     conda:
         "../envs/dine.yaml"
     threads: THREADS
@@ -165,7 +129,7 @@ rule pretraining_prior:
         **request("prior"),
     params:
         fields=lambda wildcards, input: options("--fields", input),
-        settings=json.dumps({"kind": "pca"}),
+        settings=section(dine_config.PriorConfig(kind="pca")),
         seed=CONFIG.seed,
         code=code_digest("fit-prior", "pca"),
     shell:
@@ -173,50 +137,26 @@ rule pretraining_prior:
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
 
 
-rule pretraining_calibration:
+use rule calibrate as pretraining_calibration with:
     input:
-        model=rules.pretrain.output.model,
-        pairs=expand(PRETRAINING / "{shape}" / "pairs.h5", shape=LEVELS),
-        targets=expand(PRETRAINING / "{shape}" / "resampled.h5", shape=LEVELS),
-        prior=rules.pretraining_prior.output,
+        model=PRETRAINED.model,
+        pairs=[data.pairs for data in SHAPES_DATA],
+        targets=[data.resampled for data in SHAPES_DATA],
+        priors=[PRETRAINED.prior],
     output:
-        calibration=PRETRAINING / "{backbone}" / "calibration.json",
-        plot=PRETRAINING / "{backbone}" / "calibration.png",
+        calibration=PRETRAINED.calibration,
+        plot=PRETRAINED.calibration_plot,
     log:
-        LOGS / "pretraining" / "{backbone}_calibration.log",
-    conda:
-        "../envs/dine.yaml"
-    threads: THREADS
-    resources:
-        **request("prediction"),
+        FILES.log("pretraining", "{backbone}_calibration"),
     params:
-        pairs=lambda wildcards, input: options("--pairs", input.pairs),
-        targets=lambda wildcards, input: options("--targets", input.targets),
+        data=lambda wildcards, input: calibration_options(input),
         device=CONFIG.device,
         code=lambda wildcards: code_digest(
-            "calibrate", backbone_config(wildcards).kind, "pca"
+            "calibrate", PLAN.backbone(wildcards.backbone).kind, "pca"
         ),
-    shell:
-        "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
-        " {params.pairs} {params.targets} --prior {input.prior:q} --device {params.device}"
-        " --out {output.calibration:q}"
 
 
 # All of it, so that a deleted file is made again.
 rule pretrained:
     input:
-        expand(
-            PRETRAINING / "{shape}" / "{file}",
-            shape=LEVELS,
-            file=["raw.json", "pairs.h5", "resampled.h5"],
-        ),
-        expand(
-            PRETRAINING / "{backbone}" / "{file}",
-            backbone=CONFIG.backbones,
-            file=["model.safetensors", "prior.safetensors", "calibration.json"],
-        ),
-        expand(
-            PRETRAINING / "{backbone}" / "fields_{shape}.h5",
-            backbone=CONFIG.backbones,
-            shape=LEVELS,
-        ),
+        PLAN.pretrained_kept(),

@@ -5,11 +5,11 @@ rule fit_prior:
     input:
         rules.fields.output,
     output:
-        RESULTS / "{dataset}" / "{backbone}" / "priors" / "{prior}.safetensors",
+        FILES.prior("{dataset}", "{backbone}", "{prior}"),
     log:
-        LOGS / "{dataset}" / "{backbone}" / "priors" / "{prior}.log",
+        FILES.log("{dataset}", "{backbone}", "priors", "{prior}"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "priors" / "{prior}.tsv"
+        FILES.benchmark("{dataset}", "{backbone}", "priors", "{prior}")
     priority: 30
     conda:
         "../envs/dine.yaml"
@@ -17,9 +17,9 @@ rule fit_prior:
     resources:
         **request("prior"),
     params:
-        settings=prior_settings,
-        seed=training_seed,
-        code=lambda wildcards: code_of("fit-prior", priors=[wildcards.prior]),
+        settings=lambda wildcards: PLAN.prior(wildcards.prior),
+        seed=lambda wildcards: PLAN.seed(wildcards.backbone),
+        code=lambda wildcards: PLAN.code("fit-prior", priors=[wildcards.prior]),
     shell:
         "dine --log {log:q} --threads {threads} fit-prior --fields {input:q}"
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
@@ -27,15 +27,15 @@ rule fit_prior:
 
 rule search_lambda:
     input:
-        pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
-        model=FILES.run(SEARCH.dataset, SEARCH.backbone, "stage1", "model.safetensors"),
-        priors=searched_priors(SEARCH.backbone),
+        pairs=FILES.data(SEARCH.dataset).pairs,
+        model=FILES.run(SEARCH.dataset, SEARCH.backbone, "stage1").model,
+        priors=PLAN.searched_priors(SEARCH.backbone),
     output:
         FILES.search,
     log:
-        LOGS / "search_lambda.log",
+        FILES.log("search_lambda"),
     benchmark:
-        BENCHMARKS / "search_lambda.tsv"
+        FILES.benchmark("search_lambda")
     priority: 40
     conda:
         "../envs/dine.yaml"
@@ -47,35 +47,29 @@ rule search_lambda:
             "--prior", CONFIG.searched(SEARCH.backbone), input.priors
         ),
         stage2=section(CONFIG.stage2),
-        settings=search_settings(SEARCH.backbone),
+        settings=PLAN.search(SEARCH.backbone),
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=code_of(
-            "search-lambda",
-            SEARCH.backbone,
-            data_term=CONFIG.stage2.data_term,
-            priors=CONFIG.searched(SEARCH.backbone),
-        ),
+        code=PLAN.search_code(SEARCH.backbone),
     shell:
         "dine --log {log:q} --threads {threads} search-lambda --pairs {input.pairs:q}"
         " --model {input.model:q} {params.priors} --stage2 {params.stage2:q}"
         " --settings {params.settings:q} --seed {params.seed}"
-        " {params.compute} --processes {resources.processes}"
-        " --out {output:q}"
+        " {params.compute} --processes {resources.processes} --out {output:q}"
 
 
 # With a backbone of its own: `own_lambda`.
 use rule search_lambda as search_own_lambda with:
     input:
-        pairs=FILES.dataset(SEARCH.dataset, "pairs.h5"),
-        model=RESULTS / SEARCH.dataset / "{searching}" / "stage1" / "model.safetensors",
-        priors=lambda wildcards: searched_priors(wildcards.searching),
+        pairs=FILES.data(SEARCH.dataset).pairs,
+        model=FILES.run(SEARCH.dataset, "{searching}", "stage1").model,
+        priors=lambda wildcards: PLAN.searched_priors(wildcards.searching),
     output:
-        RESULTS / "lambda" / "{searching}" / "lambda.json",
+        FILES.search_of("{searching}"),
     log:
-        LOGS / "search_lambda_{searching}.log",
+        FILES.log("search_lambda_{searching}"),
     benchmark:
-        BENCHMARKS / "search_lambda_{searching}.tsv"
+        FILES.benchmark("search_lambda_{searching}")
     wildcard_constraints:
         searching="|".join(own_searches(CONFIG)) or NOTHING,
     params:
@@ -83,12 +77,7 @@ use rule search_lambda as search_own_lambda with:
             "--prior", CONFIG.searched(wildcards.searching), input.priors
         ),
         stage2=section(CONFIG.stage2),
-        settings=lambda wildcards: search_settings(wildcards.searching),
+        settings=lambda wildcards: PLAN.search(wildcards.searching),
         seed=CONFIG.seed,
         compute=COMPUTE,
-        code=lambda wildcards: code_of(
-            "search-lambda",
-            wildcards.searching,
-            data_term=CONFIG.stage2.data_term,
-            priors=CONFIG.searched(wildcards.searching),
-        ),
+        code=lambda wildcards: PLAN.search_code(wildcards.searching),

@@ -2,61 +2,52 @@
 
 
 # Two scans share no points, so expected errors are learned where targets share none either.
-rule calibration_targets:
-    input:
-        unpack(raw_files),
-        pairs=rules.pairs.output,
+use rule resample as calibration_targets with:
     output:
-        RESULTS / "{dataset}" / "resampled.h5",
+        DATA.resampled,
     log:
-        LOGS / "{dataset}" / "resampled.log",
-    conda:
-        "../envs/dine.yaml"
-    resources:
-        **request("data"),
+        FILES.log("{dataset}", "resampled"),
+    benchmark:
+        FILES.benchmark("{dataset}", "resampled")
     params:
-        raws=raw_options,
+        raws=lambda wildcards, input: options("--raw", input.raws),
+        some="",
         seed=CONFIG.seed,
         code=code_digest("resample"),
-    shell:
-        "dine --log {log:q} resample {params.raws} --pairs {input.pairs:q}"
-        " --seed {params.seed} --out {output:q}"
 
 
 rule calibrate:
     input:
-        model=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "model.safetensors",
-        pairs=rules.pairs.output,
-        targets=rules.calibration_targets.output,
-        prior=calibrating_prior,
+        model=NETWORK.model,
+        pairs=[DATA.pairs],
+        targets=[DATA.resampled],
+        priors=lambda wildcards: PLAN.calibrating_files(
+            wildcards.dataset, wildcards.backbone
+        ),
     output:
-        calibration=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "calibration.json",
-        plot=RESULTS / "{dataset}" / "{backbone}" / "{run}" / "calibration.png",
+        calibration=NETWORK.calibration,
+        plot=NETWORK.calibration_plot,
     log:
-        LOGS / "{dataset}" / "{backbone}" / "{run}" / "calibrate.log",
+        FILES.log("{dataset}", "{backbone}", "{run}", "calibrate"),
     conda:
         "../envs/dine.yaml"
     threads: THREADS
     resources:
         **request("prediction"),
     params:
-        prior=lambda wildcards, input: options("--prior", input.prior),
+        data=lambda wildcards, input: calibration_options(input),
         device=CONFIG.device,
-        code=lambda wildcards: code_of(
-            "calibrate", wildcards.backbone, priors=calibrating_priors(wildcards)
+        code=lambda wildcards: PLAN.code(
+            "calibrate",
+            wildcards.backbone,
+            priors=PLAN.calibrating(wildcards.backbone),
         ),
     shell:
         "dine --log {log:q} --threads {threads} calibrate --model {input.model:q}"
-        " --pairs {input.pairs:q} --targets {input.targets:q} {params.prior} --device {params.device}"
-        " --out {output.calibration:q}"
+        " {params.data} --device {params.device} --out {output.calibration:q}"
 
 
 # With what it makes on its way, so that a deleted file is made again.
 rule calibrations:
     input:
-        [
-            FILES.run(*run, name)
-            for run in RUNS
-            for name in ("model.safetensors", "calibration.json")
-        ],
-        priors_from("pairs.h5", "resampled.h5"),
+        PLAN.calibrations_kept(),

@@ -1,31 +1,29 @@
 # Tables, figures, the report, and one small table for each prior on its own.
 
-METRICS = [FILES.run(*run, "metrics.csv") for run in RUNS]
+METRICS = [run.metrics for run in RUNS]
 
 
 rule tables:
     input:
         METRICS,
     output:
-        all=RESULTS / "tables" / "all.md",
+        all=FILES.table("all", "md"),
         tables=[
             report(
-                RESULTS / "tables" / f"{table}.csv",
+                FILES.table(table, "csv"),
                 caption="../report/table.rst",
                 category="Tables",
                 labels={"table": table},
             )
             for table in TABLES
         ],
-        others=expand(
-            RESULTS / "tables" / "{table}.{suffix}",
-            table=TABLES,
-            suffix=["md", "tex"],
-        ),
+        others=[
+            FILES.table(table, suffix) for table in TABLES for suffix in ("md", "tex")
+        ],
     log:
-        LOGS / "tables.log",
+        FILES.log("tables"),
     benchmark:
-        BENCHMARKS / "tables.tsv"
+        FILES.benchmark("tables")
     conda:
         "../envs/dine.yaml"
     resources:
@@ -41,34 +39,30 @@ rule tables:
 rule figures:
     input:
         METRICS,
-        [
-            FILES.run(*run, name)
-            for run in RUNS
-            for name in ("predictions.h5", "point_errors.h5", "history.csv")
-        ],
-        [FILES.dataset(dataset, "pairs.h5") for dataset in CONFIG.datasets],
-        SEARCHES,
+        [[run.predictions, run.point_errors, run.history] for run in RUNS],
+        [FILES.data(dataset).pairs for dataset in CONFIG.datasets],
+        PLAN.searches,
     output:
         figures=[
             report(
-                RESULTS / "figures" / f"{figure}.png",
+                FILES.figure(figure, "png"),
                 caption="../report/figure.rst",
                 category="Figures",
                 labels={"figure": figure},
             )
             for figure in FIGURES
         ],
-        pdf=expand(RESULTS / "figures" / "{figure}.pdf", figure=FIGURES),
+        pdf=[FILES.figure(figure, "pdf") for figure in FIGURES],
     log:
-        LOGS / "figures.log",
+        FILES.log("figures"),
     benchmark:
-        BENCHMARKS / "figures.tsv"
+        FILES.benchmark("figures")
     conda:
         "../envs/dine.yaml"
     resources:
         **request("reporting"),
     params:
-        settings=drawn_settings(),
+        settings=PLAN.drawn,
         code=code_digest("figures"),
     shell:
         'drawn="$(dirname -- {output.figures[0]:q})";'
@@ -78,9 +72,9 @@ rule figures:
 
 rule resolved_config:
     output:
-        RESULTS / "config.yaml",
+        FILES.config,
     log:
-        LOGS / "config.log",
+        FILES.log("config"),
     conda:
         "../envs/dine.yaml"
     resources:
@@ -94,30 +88,27 @@ rule resolved_config:
 rule html:
     input:
         METRICS,
-        [FILES.run(*run, "run.json") for run in RUNS],
+        [run.record for run in RUNS],
         [
-            FILES.dataset(dataset, name)
-            for dataset in CONFIG.datasets
-            for name in ("agreement.json", "inventory.csv", "left_out.csv")
+            [data.agreement, data.inventory, data.left_out]
+            for data in map(FILES.data, CONFIG.datasets)
         ],
         rules.tables.output,
         rules.figures.output,
         rules.resolved_config.output,
-        SEARCHES,
+        PLAN.searches,
     output:
-        report(
-            RESULTS / "report.html", caption="../report/report.rst", category="Report"
-        ),
+        report(FILES.report, caption="../report/report.rst", category="Report"),
     log:
-        LOGS / "html.log",
+        FILES.log("html"),
     benchmark:
-        BENCHMARKS / "html.tsv"
+        FILES.benchmark("html")
     conda:
         "../envs/dine.yaml"
     resources:
         **request("reporting"),
     params:
-        settings=whole_config(),
+        settings=PLAN.whole,
         code=code_digest("report"),
     shell:
         'dine --log {log:q} report --results "$(dirname -- {output:q})"'
@@ -132,18 +123,18 @@ for PRIOR in CONFIG.priors:
             f"prior_{PRIOR}"
         input:
             [
-                FILES.run(dataset, backbone, method, "metrics.csv")
+                FILES.run(dataset, backbone, method).metrics
                 for dataset in CONFIG.datasets
                 for backbone in CONFIG.backbones_of(dataset)
                 if PRIOR in CONFIG.backbones[backbone].priors
                 for method in (dine_config.STAGE1, dine_config.CONTROL, PRIOR)
             ],
         output:
-            RESULTS / "ablation" / PRIOR / "all.md",
+            FILES.ablation(PRIOR),
         log:
-            LOGS / "ablation" / f"{PRIOR}.log",
+            FILES.log("ablation", PRIOR),
         benchmark:
-            BENCHMARKS / "ablation" / f"{PRIOR}.tsv"
+            FILES.benchmark("ablation", PRIOR)
         conda:
             "../envs/dine.yaml"
         resources:
@@ -159,14 +150,10 @@ for PRIOR in CONFIG.priors:
 # Handles for parts of the work.
 rule data:
     input:
-        [FILES.dataset(dataset, "agreement.json") for dataset in CONFIG.datasets],
-        [
-            FILES.variant(dataset, *condition)
-            for dataset in CONFIG.datasets
-            for condition in conditions(CONFIG, dataset)
-        ],
+        [FILES.data(dataset).agreement for dataset in CONFIG.datasets],
+        [PLAN.variants(dataset) for dataset in CONFIG.datasets],
 
 
 rule train:
     input:
-        [FILES.run(*run, "model.safetensors") for run in RUNS],
+        [run.model for run in RUNS],

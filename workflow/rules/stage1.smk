@@ -5,13 +5,11 @@ rule stage1:
     input:
         pairs=rules.pairs.output,
     output:
-        model=RESULTS / "{dataset}" / "{backbone}" / "stage1" / "model.safetensors",
-        history=RESULTS / "{dataset}" / "{backbone}" / "stage1" / "history.csv",
-        record=RESULTS / "{dataset}" / "{backbone}" / "stage1" / "run.json",
+        **trained(STAGE1),
     log:
-        LOGS / "{dataset}" / "{backbone}" / "stage1.log",
+        FILES.log("{dataset}", "{backbone}", "stage1"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "stage1.tsv"
+        FILES.benchmark("{dataset}", "{backbone}", "stage1")
     priority: 10
     conda:
         "../envs/dine.yaml"
@@ -19,11 +17,11 @@ rule stage1:
     resources:
         **request("training"),
     params:
-        backbone=backbone_settings,
-        settings=stage1_settings,
-        seed=training_seed,
+        backbone=lambda wildcards: PLAN.network(wildcards.backbone),
+        settings=lambda wildcards: PLAN.stage1(wildcards.backbone),
+        seed=lambda wildcards: PLAN.seed(wildcards.backbone),
         compute=COMPUTE,
-        code=lambda wildcards: code_of(
+        code=lambda wildcards: PLAN.code(
             "stage1", wildcards.backbone, data_term=CONFIG.stage1.data_term
         ),
     shell:
@@ -39,11 +37,11 @@ rule fields:
         model=rules.stage1.output.model,
         pairs=rules.pairs.output,
     output:
-        RESULTS / "{dataset}" / "{backbone}" / "dvf.h5",
+        FILES.fields("{dataset}", "{backbone}"),
     log:
-        LOGS / "{dataset}" / "{backbone}" / "fields.log",
+        FILES.log("{dataset}", "{backbone}", "fields"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "fields.tsv"
+        FILES.benchmark("{dataset}", "{backbone}", "fields")
     priority: 20
     conda:
         "../envs/dine.yaml"
@@ -53,7 +51,7 @@ rule fields:
     params:
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
-        code=lambda wildcards: code_of("fields", wildcards.backbone),
+        code=lambda wildcards: PLAN.code("fields", wildcards.backbone),
     shell:
         "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
         " --pairs {input.pairs:q} --batch-size {params.batch} {params.compute}"

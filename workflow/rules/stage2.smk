@@ -6,66 +6,55 @@ rule stage2_control:
         pairs=rules.pairs.output,
         model=rules.stage1.output.model,
     output:
-        **stage2_outputs(dine_config.CONTROL),
+        **trained(FILES.run("{dataset}", "{backbone}", dine_config.CONTROL)),
     log:
-        LOGS / "{dataset}" / "{backbone}" / "stage2" / "lambda0.log",
+        FILES.log("{dataset}", "{backbone}", "stage2", dine_config.CONTROL),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "lambda0.tsv"
+        FILES.benchmark("{dataset}", "{backbone}", "stage2", dine_config.CONTROL)
     conda:
         "../envs/dine.yaml"
     threads: THREADS * PROCESSES
     resources:
         **request("training"),
     params:
+        variant=dine_config.CONTROL,
+        prior="",
         settings=section(CONFIG.stage2),
-        seed=training_seed,
+        seed=lambda wildcards: PLAN.seed(wildcards.backbone),
         compute=COMPUTE,
-        code=lambda wildcards: code_of(
+        code=lambda wildcards: PLAN.code(
             "stage2", wildcards.backbone, data_term=CONFIG.stage2.data_term
         ),
     shell:
         "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
-        " --model {input.model:q} --settings {params.settings:q} --seed {params.seed}"
+        " --model {input.model:q} --variant {params.variant} {params.prior}"
+        " --settings {params.settings:q} --seed {params.seed}"
         " {params.compute} --processes {resources.processes}"
-        " --name '{wildcards.dataset}/{wildcards.backbone}/lambda0'"
+        " --name '{wildcards.dataset}/{wildcards.backbone}/{params.variant}'"
         ' --out "$(dirname -- {output.model:q})"'
 
 
-rule stage2_prior:
+use rule stage2_control as stage2_prior with:
     input:
         pairs=rules.pairs.output,
         model=rules.stage1.output.model,
-        prior=RESULTS
-        / "{dataset}"
-        / "{backbone}"
-        / "priors"
-        / "{prior_of_stage2}.safetensors",
-        weight=search_file,
+        prior=FILES.prior("{dataset}", "{backbone}", "{prior_of_stage2}"),
+        weight=lambda wildcards: PLAN.search_file(wildcards.backbone),
     output:
-        **stage2_outputs("{prior_of_stage2}"),
+        **trained(FILES.run("{dataset}", "{backbone}", "{prior_of_stage2}")),
     log:
-        LOGS / "{dataset}" / "{backbone}" / "stage2" / "{prior_of_stage2}.log",
+        FILES.log("{dataset}", "{backbone}", "stage2", "{prior_of_stage2}"),
     benchmark:
-        BENCHMARKS / "{dataset}" / "{backbone}" / "stage2" / "{prior_of_stage2}.tsv"
-    conda:
-        "../envs/dine.yaml"
-    threads: THREADS * PROCESSES
-    resources:
-        **request("training"),
+        FILES.benchmark("{dataset}", "{backbone}", "stage2", "{prior_of_stage2}")
     params:
+        variant=lambda wildcards: wildcards.prior_of_stage2,
+        prior=lambda wildcards, input: prior_options(input.prior, input.weight),
         settings=section(CONFIG.stage2),
-        seed=training_seed,
+        seed=lambda wildcards: PLAN.seed(wildcards.backbone),
         compute=COMPUTE,
-        code=lambda wildcards: code_of(
+        code=lambda wildcards: PLAN.code(
             "stage2",
             wildcards.backbone,
             data_term=CONFIG.stage2.data_term,
             priors=[wildcards.prior_of_stage2],
         ),
-    shell:
-        "dine --log {log:q} --threads {threads} stage2 --pairs {input.pairs:q}"
-        " --model {input.model:q} --variant {wildcards.prior_of_stage2} --prior {input.prior:q}"
-        " --lambda {input.weight:q} --settings {params.settings:q} --seed {params.seed}"
-        " {params.compute} --processes {resources.processes}"
-        " --name '{wildcards.dataset}/{wildcards.backbone}/{wildcards.prior_of_stage2}'"
-        ' --out "$(dirname -- {output.model:q})"'

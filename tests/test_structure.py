@@ -1,0 +1,75 @@
+"""The rules of CONTRIBUTING.md about what stands where."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "dine"
+RULES = sorted((ROOT / "workflow" / "rules").glob("*.smk"))
+
+# From the ground up: a module imports from its own floor and those before it.
+FLOORS = [
+    ("errors", "files", "progress", "registry"),
+    ("config",),
+    ("results", "provenance"),
+    ("plan",),
+    ("geometry",),
+    ("data",),
+    ("models",),
+    ("priors",),
+    ("evaluation", "training"),
+    ("registration",),
+    ("reporting",),
+    ("cli",),
+]
+
+
+def floor_of(module):
+    """The floor of ``dine.x.y``."""
+    part = module.split(".")[1]
+    return next(floor for floor, names in enumerate(FLOORS) if part in names)
+
+
+def imported(path):
+    """Modules of ``dine`` that a file imports, inside functions too."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            whole = node.module == "dine"
+            names = [f"dine.{alias.name}" for alias in node.names] if whole else [node.module]
+        else:
+            continue
+        yield from (name for name in names if name.startswith("dine.") and "__" not in name)
+
+
+def modules():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = ".".join(("dine", *path.relative_to(PACKAGE).with_suffix("").parts))
+        if name not in ("dine.__init__", "dine.__main__"):
+            yield pytest.param(name.removesuffix(".__init__"), path, id=name)
+
+
+@pytest.mark.parametrize(("name", "path"), modules())
+def test_nothing_imports_upwards(name, path):
+    own = floor_of(name)
+    assert not {other for other in imported(path) if floor_of(other) > own}
+
+
+@pytest.mark.parametrize("path", RULES, ids=lambda path: path.name)
+def test_rules_compute_nothing_and_know_no_names_of_results(path):
+    text = path.read_text()
+    if path.name != "common.smk":
+        assert not re.search(r"^\s*def ", text, re.MULTILINE)
+    assert not re.findall(r"\w+\.(?:h5|csv|json|safetensors|html|pdf|tsv|log)[\"']", text)
+    assert len(text.splitlines()) <= (200 if path.name == "common.smk" else 400)
+
+
+def test_only_results_knows_where_a_run_keeps_its_files():
+    named = re.compile(r'"(?:pairs\.h5|raw\.json|run\.json|history\.csv|metrics\.csv|dvf\.h5)"')
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path != PACKAGE / "results.py":
+            assert not named.search(path.read_text()), path
