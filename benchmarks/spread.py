@@ -20,7 +20,8 @@ import pandas as pd
 from dine import config as dine_config
 from dine.files import read_json
 from dine.reporting.effects import effects
-from dine.reporting.tables import METHOD_NAMES, OBJECTS_NAMES, display_name, load_metrics
+from dine.reporting.loading import load_metrics
+from dine.reporting.names import METHODS, OBJECTS, display_name
 from dine.results import CLEAN, Results, runs, trained_on
 
 KEYS = ["objects", "dataset", "backbone", "method"]
@@ -67,7 +68,7 @@ def main(folders: list[Path]) -> int:
             rows = [table.loc[place] for table in tables if place in table.index]
             spreads.append(np.std([row["relative"] for row in rows], ddof=1))
             cells = [
-                OBJECTS_NAMES[place[0]],
+                OBJECTS[place[0]],
                 display_name(trained_on(place[1])),
                 *map(display_name, place[2:]),
                 *(f"{signed(row['relative'])} %{MARKS[row['verdict']]}" for row in rows),
@@ -86,7 +87,7 @@ def summary(found: list[tuple[dict[str, str], pd.DataFrame, pd.DataFrame]]) -> N
     every = pd.concat(means).groupby(level=places, sort=False)
     verdicts = pd.concat([table[table["condition"] == CLEAN] for _, _, table in found])
     said = verdicts.groupby([*places, "method"])["verdict"].agg(set)
-    order = [name for name in METHOD_NAMES if name in means[0]]
+    order = [name for name in METHODS if name in means[0]]
     print(f"| objects | dataset | backbone | {' | '.join(map(display_name, order))} |")
     print(f"|{'---|' * (3 + len(order))}")
     low, middle, high = every.min(), every.mean(), every.max()
@@ -101,7 +102,7 @@ def summary(found: list[tuple[dict[str, str], pd.DataFrame, pd.DataFrame]]) -> N
             agreed = "" if words is None else f", {words.pop() if len(words) == 1 else 'undecided'}"
             cells.append(f"{middle.loc[place, name]:.1f} ({ends}){agreed}")
         names = [
-            OBJECTS_NAMES[place[0]],
+            OBJECTS[place[0]],
             display_name(trained_on(place[1])),
             display_name(place[2]),
         ]

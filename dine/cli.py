@@ -666,12 +666,12 @@ def tables(metrics, spread, out):
 
     Example: dine tables a/metrics.csv b/metrics.csv --out tables
     """
-    from dine.reporting.tables import all_tables, load_metrics, to_markdown, write_table
+    from dine.reporting.loading import load_metrics
+    from dine.reporting.table import write_tables
+    from dine.reporting.tables import all_tables
 
     made = all_tables(load_metrics(metrics), spread)
-    for table in made:
-        write_table(table, out / table.name)
-    write_text(out / "all.md", "\n\n".join(to_markdown(table) for table in made))
+    write_tables(made, out)
 
 
 @cli.command()
@@ -726,7 +726,7 @@ def examples(pairs, variants, names, predictions, methods, dataset, out):
     Example: dine examples --pairs pairs.h5 --method cpd --predictions cpd.h5 --dataset synbench
     --out examples.png
     """
-    from dine.reporting.evidence import draw_examples
+    from dine.reporting.examples import draw_examples
 
     if len(names) != len(predictions):
         raise click.UsageError("Give as many --method as --predictions.")
@@ -759,18 +759,11 @@ def evidence(metrics, methods, reference, searches, diagnostics, examples, setti
     Example: dine evidence a/metrics.csv b/metrics.csv --methods '{"pca": {"title": "PCA prior",
     "group": "prior"}}' --search lambda.json --out evidence
     """
-    from dine.reporting.evidence import Picture, build_evidence
+    from dine.reporting.evidence import Example, Files, build_evidence
 
-    build_evidence(
-        metrics,
-        out,
-        methods=methods,
-        reference=reference,
-        searches=searches,
-        diagnostics=diagnostics,
-        examples=[Picture(*example) for example in examples],
-        config=settings,
-    )
+    shown = [Example(*example) for example in examples]
+    files = Files(metrics, searches, diagnostics, shown)
+    build_evidence(files, out, methods=methods, reference=reference, config=settings)
 
 
 # --- own scans ------------------------------------------------------------------------------------

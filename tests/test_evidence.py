@@ -13,14 +13,14 @@ from dine.errors import DataError
 from dine.evaluation import statistics
 from dine.reporting.evidence import (
     Evidence,
-    Picture,
+    Example,
+    Files,
     build_evidence,
     figures,
     load_evidence,
     tables,
 )
 from dine.reporting.evidence.comparisons import at
-from dine.reporting.evidence.findings import all_findings
 from dine.reporting.figures import save_figure
 
 pytestmark = pytest.mark.numerical
@@ -107,9 +107,37 @@ def compared(*args, **options):
     return Evidence(made_up(*args, **options), METHODS)
 
 
-def said(evidence):
-    """All findings as one text, and each by its beginning."""
-    return "\n".join(" | ".join((f.text, *f.parts)) for f in all_findings(evidence))
+def shown(table):
+    """The text of a table's cells by method and column."""
+    headings = [f"{group} {label}".strip() for group, label in table.header]
+    rows = {}
+    for row in table.rows:
+        cells = dict(zip(headings, row, strict=True))
+        rows[cells["Method"].text] = cells
+    return rows
+
+
+def goals(evidence):
+    """Cells of the goal by method: reached, evaluated, and those with both means lower."""
+    columns = ("Reached", "Evaluated", "Both lower")
+    rows = shown(tables.goal_table(evidence))
+    return {name: tuple(row[x].text for x in columns) for name, row in rows.items()}
+
+
+def best(evidence):
+    """The methods whose means at large levels are shown as the lowest, by MCE and CD."""
+    group = "Mean, levels from 0.4 on"
+    labels = (f"{group} Mean correspondence error", f"{group} Chamfer distance ×10⁻⁴")
+    rows = shown(tables.goal_table(evidence))
+    return [[name for name, row in rows.items() if row[label].bold] for label in labels]
+
+
+def verdicts(evidence, place, method):
+    """What is said of a method on clean targets, and at how many levels: MCE and CD."""
+    cells = shown(tables.verdict_table(evidence, place))[method]
+    groups = ("Mean correspondence error", "Chamfer distance ×10⁻⁴")
+    clean = [cells[f"{group} Clean targets"].text for group in groups]
+    return clean + [cells[f"{group} Levels ▼ / ▲"].text for group in groups]
 
 
 def search(folder, **changes):
@@ -197,78 +225,103 @@ def evidence(tmp_path_factory):
     return Evidence(load_evidence(paths), METHODS)
 
 
-def test_findings_where_the_goal_is_reached(evidence):
-    words = said(evidence)
-    assert (
-        "The paper's prior, PCA prior, is significantly better than λ = 0 at every level, by both "
-        "measures. Of 32 comparisons (each level, by MCE and by CD) 32 are significantly lower and "
-        "0 significantly higher"
-    ) in words
-    assert (
-        "SynBench (synthetic data), DefTransNet: MCE lower at 4 of 4 levels (4 significantly), "
-        "significantly higher at 0; CD lower at 4 of 4 levels (4 significantly)"
-    ) in words
-    assert re.search(
-        r"trained with a prior.*PCA prior has the lowest mean correspondence error \(0\.0\d+, "
-        r"−(19|20)\.\d % against λ = 0\) and the lowest Chamfer distance \(\d+\.\d\d ×10⁻⁴, "
-        r"−3\d\.\d %",
-        words,
+def test_verdicts_where_the_goal_is_reached(evidence):
+    for place in evidence.places:
+        mce, cd, *levels = verdicts(evidence, place, "PCA prior")
+        assert re.fullmatch(r"lower: −(19|20|21) % \(−\d+ to −\d+\)", mce)
+        assert re.fullmatch(r"lower: −3\d % \(−\d+ to −\d+\)", cd)
+        assert levels == ["4 / 0 of 4", "4 / 0 of 4"]
+        assert verdicts(evidence, place, "Smoothness")[0].startswith("higher: +1")
+    rows = shown(tables.verdict_table(evidence, ("synbench", "deftransnet")))
+    assert rows["MAP"]["Mean correspondence error Clean targets"].bold
+    assert not rows["Smoothness"]["Mean correspondence error Clean targets"].bold
+    assert re.match(
+        r"lower: −(29|30|31) %", rows["MAP"]["Mean correspondence error Other points"].text
     )
-    assert re.search(r"Of all methods.*MAP has the lowest mean correspondence error", words)
-    assert "every backbone (12 cells). Reached by PCA prior, Gaussian process and MAP." in words
-    assert (
-        "best classical method of each level (CPD): all that reach the goal are lower by both"
-        in words
+    # Of what was not evaluated nothing is said, nor of what registers nothing or is the reference.
+    assert "Mean correspondence error Other points" not in next(
+        iter(shown(tables.verdict_table(evidence, ("deformedtissue", "deftransnet"))).values())
     )
-    assert "MAP is lower in MCE at 16 of 16 levels and in CD at 16 of 16 levels." in words
-    assert "What did not help: Smoothness is significantly worse than λ = 0 at some level" in words
-    assert "All data are synthetic." in words
-    assert "48 test pairs of 12 objects at 4 levels, 3 training seeds of each network." in words
-    assert "with 12 test objects a dataset the intervals are too narrow" in words
-    assert "How much another training would differ" not in words
+    assert {"Unregistered", "λ = 0", "λ = 0 (reference)"}.isdisjoint(rows)
+    found = goals(evidence)
+    reached = {name for name, cells in found.items() if cells[0] == "12 of 12"}
+    assert reached == {"PCA prior", "Gaussian process", "MAP"}
+    assert found["CPD"] == ("0 of 12", "12", "0")
+    assert best(evidence) == [["MAP"], ["MAP"]]
+    cells = shown(tables.goal_table(evidence))
+    mean = cells["PCA prior"]["Mean, levels from 0.4 on Mean correspondence error"].text
+    assert re.fullmatch(r"0\.0\d+ \(−(19|20)\.\d %\)", mean)
+    below = [cells[name]["Below the best classical MCE"].text for name in ("MAP", "Smoothness")]
+    assert below == ["16 of 16", "16 of 16"]
+    assert cells["CPD"]["Below the best classical MCE"].text == "–"
 
 
-def test_findings_where_the_goal_is_missed():
+def test_what_the_numbers_rest_on(evidence):
+    rows = [[cell.text for cell in row] for row in tables.basis_table(evidence).rows]
+    assert rows == [
+        ["DeformedTissue (synthetic data)", "48", "12", "4", "3", "3", "yes"],
+        ["SynBench (synthetic data)", "48", "12", "4", "3", "3", "yes"],
+    ]
+
+
+def test_the_chance_of_the_training_widens_intervals_and_undecides():
+    metrics = made_up({"lambda0": 1.0, "pca": 0.9}, datasets=("synbench",), seeds=1)
+    place = ("synbench", "deftransnet")
+    for spread, said in ((0.0, "lower: −10 % "), (0.1, "undecided: −10 % (−30 to +10)")):
+        evidence = Evidence(metrics, METHODS, spread=spread)
+        mce, _, *levels = verdicts(evidence, place, "PCA prior")
+        assert mce.startswith(said)
+        # Tests ask about the pairs alone.
+        assert levels == ["4 / 0 of 4"] * 2
+
+
+def test_verdicts_where_the_goal_is_missed():
     def here_only(dataset, backbone, level):
         return 0.8 if (dataset, backbone) == ("synbench", "deftransnet") or level < 0.5 else 1.0
 
     effects = {"lambda0": 1.0, "pca": here_only, "gp": 1.0, "cpd": 0.9}
-    words = said(compared(effects, seeds=1, corrupted=False))
-    assert "PCA prior, is significantly better than λ = 0 at some levels and significantly" in words
-    # CPD reaches it, but is classical: the goal is judged for the others beside it.
-    assert "Reached by CPD. Of the methods that are not classical, closest is PCA prior:" in words
-    assert "closest is PCA prior: 6 of 12 cells hold" in words
-    assert "best classical method of each level (CPD): PCA prior is not lower" in words
+    evidence = compared(effects, seeds=1, corrupted=False)
+    found = goals(evidence)
+    assert found["CPD"] == ("12 of 12", "12", "12")
+    assert found["PCA prior"][:2] == ("6 of 12", "12")
+    cells = shown(tables.goal_table(evidence))["PCA prior"]
+    assert cells[f"{tables.GOAL_CELLS} SynBench, DefTransNet"].text == "3 / 0 of 3"
+    assert cells[f"{tables.GOAL_CELLS} SynBench, Robust-DefReg"].text == "1 / 0 of 3"
+    below = cells["Below the best classical MCE"].text
+    assert re.fullmatch(r"(1[0-3]) of 16", below)
+    assert verdicts(evidence, ("synbench", "robust_defreg"), "PCA prior")[2] == "2 / 0 of 4"
     del effects["cpd"]
-    words = said(compared(effects, seeds=1, datasets=("synbench",), corrupted=False))
-    assert "No method reaches it. Closest is PCA prior: 4 of 6 cells hold" in words
-    assert "No classical method was evaluated, so how PCA prior compares" in words
+    evidence = compared(effects, seeds=1, datasets=("synbench",), corrupted=False)
+    assert goals(evidence)["PCA prior"][:2] == ("4 of 6", "6")
+    # Without a classical method nothing is said about them.
+    assert (
+        shown(tables.goal_table(evidence))["PCA prior"]["Below the best classical MCE"].text == "–"
+    )
 
 
-def test_findings_where_the_prior_hurts():
+def test_verdicts_where_the_prior_hurts():
     effects = {"lambda0": 1.0, "pca": 1.2, "gp": 1.1}
-    words = said(compared(effects, seeds=1, datasets=("synbench",), corrupted=False))
-    assert "is significantly worse than λ = 0 at some levels and significantly better" in words
-    assert "0 are significantly lower and 16 significantly higher" in words
-    assert "MCE lower at 0 of 4 levels (0 significantly), significantly higher at 4" in words
-    assert "Of all methods, over all levels" in words
-    assert "λ = 0 has the lowest mean correspondence error (0." in words
-    assert "No method reaches it. Closest is Gaussian process: 0 of 6 cells hold" in words
-    assert "What did not help: PCA prior and Gaussian process are significantly worse" in words
-    assert "Every network was trained once." in words
+    evidence = compared(effects, seeds=1, datasets=("synbench",), corrupted=False)
+    for place in evidence.places:
+        mce, _, *levels = verdicts(evidence, place, "PCA prior")
+        assert mce.startswith("higher: +2")
+        assert levels == ["0 / 4 of 4"] * 2
+    assert best(evidence) == [["λ = 0 (reference)"]] * 2
+    assert goals(evidence)["Gaussian process"] == ("0 of 6", "6", "0")
+    cells = shown(tables.goal_table(evidence))["PCA prior"]
+    assert cells[f"{tables.GOAL_CELLS} SynBench, DefTransNet"].text == "0 / 3 of 3"
+    assert [cell.text for cell in tables.basis_table(evidence).rows[0][4:6]] == ["1", "1"]
 
 
-def test_findings_where_the_prior_does_both_or_nothing():
+def test_verdicts_where_the_prior_does_both_or_nothing():
     effects = {"lambda0": 1.0, "pca": lambda d, b, level: 0.8 if level > 0.5 else 1.2}
-    words = said(compared(effects, datasets=("synbench",), corrupted=False))
-    assert "better than λ = 0 at some levels and significantly worse at others" in words
-    assert "8 are significantly lower and 8 significantly higher" in words
-    assert "no method is significantly worse than λ = 0 at some level without being" in words
-    words = said(compared({"lambda0": 1.0, "pca": 1.0}, datasets=("d",), corrupted=False))
-    assert "PCA prior, cannot be told from λ = 0: no difference is significant" in words
-    assert "at another. PCA prior cannot be told from it at any level." in words
-    words = said(compared({"lambda0": 1.0, "gp": 0.9}, datasets=("d",), corrupted=False))
-    assert "The paper's prior (pca) was not evaluated on the same targets as λ = 0" in words
+    evidence = compared(effects, datasets=("synbench",), corrupted=False)
+    for place in evidence.places:
+        assert verdicts(evidence, place, "PCA prior")[2:] == ["2 / 2 of 4"] * 2
+    evidence = compared({"lambda0": 1.0, "pca": 1.0}, datasets=("d",), corrupted=False)
+    mce, _, *levels = verdicts(evidence, ("d", "deftransnet"), "PCA prior")
+    assert mce.startswith("undecided")
+    assert levels == ["0 / 0 of 4"] * 2
 
 
 def test_a_method_must_be_evaluated_everywhere_to_reach_the_goal():
@@ -276,11 +329,16 @@ def test_a_method_must_be_evaluated_everywhere_to_reach_the_goal():
         {"lambda0": 1.0, "pca": 0.8, "gp": 0.7}, datasets=("synbench",), corrupted=False
     )
     metrics = metrics[(metrics["method"] != "gp") | (metrics["backbone"] == "deftransnet")]
-    words = said(Evidence(metrics, METHODS))
-    assert "Reached by PCA prior. Gaussian process reaches it wherever evaluated" in words
+    evidence = Evidence(metrics, METHODS)
+    assert goals(evidence)["PCA prior"] == ("6 of 6", "6", "6")
+    assert goals(evidence)["Gaussian process"] == ("3 of 6", "3", "3")
     # It cannot be ranked over all backbones, but it can where it was.
-    assert "DefTransNet: Gaussian process (MCE and CD)." in words
-    assert "PCA prior has the lowest mean correspondence error" in words
+    assert best(evidence) == [["PCA prior"], ["PCA prior"]]
+    place = ("synbench", "deftransnet")
+    assert shown(tables.mean_table(evidence, place, "mce"))["Gaussian process"][
+        "All levels MCE"
+    ].bold
+    assert list(evidence.ranking(list(METHODS), "mce", [place]).index[:1]) == ["gp"]
 
 
 def test_a_method_without_a_network_is_classical_only_by_its_group():
@@ -288,49 +346,37 @@ def test_a_method_without_a_network_is_classical_only_by_its_group():
     evidence = compared(effects, seeds=2, datasets=("synbench",), corrupted=False)
     assert evidence.classical == ["cpd"]
     assert evidence.candidates == ["pca", "relaxed"]
-    words = said(evidence)
-    assert re.search("Of all methods, over all levels .*: Relaxed has the lowest mean", words)
-    assert "Reached by CPD, PCA prior and Relaxed." in words
-    assert "best classical method of each level (CPD): all that reach the goal are lower" in words
-    assert "Relaxed is lower in MCE at 8 of 8 levels and in CD at 8 of 8 levels." in words
+    assert best(evidence) == [["Relaxed"], ["Relaxed"]]
+    reached = {name for name, cells in goals(evidence).items() if cells[0] == "6 of 6"}
+    assert reached == {"CPD", "PCA prior", "Relaxed"}
+    cells = shown(tables.goal_table(evidence))["Relaxed"]
+    for value in ("MCE", "CD"):
+        assert cells[f"Below the best classical {value}"].text == "8 of 8"
     for place in evidence.places:
         assert shown(tables.answer_table(evidence, place, "mce"))["Relaxed"]["Pairs"].text == "48"
-        cells = shown(tables.level_table(evidence, place, "mce"))["Relaxed"]["Level 0.8"]
+        cells = shown(tables.mean_table(evidence, place, "mce"))["Relaxed"]["Level 0.8"]
         assert cells.bold
         assert cells.text.endswith(" ▼")
     assert figures.main_methods(evidence, "synbench") == ["cpd", "lambda0", "pca", "relaxed"]
     del effects["cpd"]
     evidence = compared(effects, seeds=1, datasets=("synbench",), corrupted=False)
     assert evidence.classical == []
-    words = said(evidence)
-    assert "No classical method was evaluated, so how PCA prior and Relaxed compare" in words
 
 
 def test_large_levels_may_be_missing():
     metrics = made_up({"lambda0": 1.0, "pca": 0.8, "gp": 0.9}, datasets=("d",), corrupted=False)
     evidence = Evidence(metrics[metrics["level"] < 0.4], METHODS)
-    words = said(evidence)
-    assert "no pair has a level of at least 0.4" in words
-    assert "Goal: no method can be judged at levels from 0.4 on" in words
+    assert tables.goal_table(evidence) is None
+    assert verdicts(evidence, ("d", "deftransnet"), "PCA prior")[0].startswith("lower")
     assert figures.forest_figure(evidence, evidence.places[0]) is None
 
 
 # ------------------------------------------------------------------------------------- tables
 
 
-def shown(table):
-    """The text of a table's cells by method and column."""
-    names = [f"{group} {label}".strip() for group, label in table.header]
-    rows = {}
-    for row in table.rows:
-        cells = dict(zip(names, row, strict=True))
-        rows[cells["Method"].text] = cells
-    return rows
-
-
 def test_level_table_holds_means_marks_and_the_lowest(evidence):
     place = ("synbench", "robust_defreg")
-    rows = shown(tables.level_table(evidence, place, "mce"))
+    rows = shown(tables.mean_table(evidence, place, "mce"))
     clean = at(evidence.clean, place)
     for name, mark in (("pca", " ▼"), ("smooth", " ▲"), ("lambda0", "")):
         mine = clean[clean["method"] == name]
@@ -346,9 +392,9 @@ def test_level_table_holds_means_marks_and_the_lowest(evidence):
     failed = f"{100 * (over_seeds > 0.1).mean():.1f}"
     assert rows["Smoothness"]["All levels Failures (%)"].text == failed
     # Without a network: the same at every backbone.
-    other = shown(tables.level_table(evidence, ("synbench", "deftransnet"), "mce"))
+    other = shown(tables.mean_table(evidence, ("synbench", "deftransnet"), "mce"))
     assert other["CPD"]["Level 0.8"].text == rows["CPD"]["Level 0.8"].text
-    cd = shown(tables.level_table(evidence, place, "cd"))
+    cd = shown(tables.mean_table(evidence, place, "cd"))
     mean = clean.loc[(clean["method"] == "map") & (clean["level"] == 0.8), "cd"].mean()
     assert cd["MAP"]["Level 0.8"].text == f"{1e4 * mean:.2f} ▼"
 
@@ -378,15 +424,20 @@ def test_answer_table_holds_the_statistics(evidence):
 
 
 def test_goal_table_counts_levels(evidence):
-    rows = shown(tables.goal_table(evidence))
-    assert rows["MAP"]["Goal cells"].text == "12 of 12"
-    assert rows["Smoothness"]["Goal cells"].text == "0 of 12"
-    assert rows["Smoothness"]["SynBench, DefTransNet: of 3 levels any ▲"].text == "3"
+    table = tables.goal_table(evidence)
+    rows = shown(table)
+    assert rows["MAP"]["Reached"].text == "12 of 12"
+    assert rows["Smoothness"]["Reached"].text == "0 of 12"
+    assert rows["Smoothness"][f"{tables.GOAL_CELLS} SynBench, DefTransNet"].text == "0 / 3 of 3"
+    counts = ["levels", "both", "both_lower", "mce", "cd", "worse"]
+    mine = at(table.data, ("synbench", "deftransnet")).set_index("method")[counts]
+    assert mine.loc["map"].tolist() == [3, 3, 3, 3, 3, 0]
+    assert mine.loc["smooth"].tolist() == [3, 0, 0, 0, 0, 3]
 
 
 def test_corruption_table_compares_with_the_same_clean_pairs(evidence):
     place = ("synbench", "robust_defreg")
-    table = tables.corruption_table(evidence, place, "mce")
+    table = tables.mean_table(evidence, place, "mce", corrupted=True)
     groups = list(dict.fromkeys(group for group, _ in table.header if group))
     assert groups == [
         "Noise σ = 0.03 (level 0.6)",
@@ -421,14 +472,14 @@ def test_a_method_seen_on_some_pairs_only_is_compared_on_these():
     evidence = Evidence(metrics[few], METHODS)
     place = ("synbench", "robust_defreg")
     assert shown(tables.answer_table(evidence, place, "mce"))["CPD"]["Pairs"].text == "12"
-    table = tables.level_table(evidence, place, "mce")
+    table = tables.mean_table(evidence, place, "mce")
     cells = shown(table)
     assert "†" in cells["CPD"]["Level 0.8"].text
     assert cells["PCA prior"]["Level 0.8"].bold
     assert "some of the pairs only" in table.caption
-    assert "Of all methods" in said(evidence)
-    assert "CPD has the lowest" not in said(evidence)
-    assert "Classical methods were evaluated on some of the pairs only." in said(evidence)
+    assert best(evidence) == [["PCA prior"], ["PCA prior"]]
+    below = shown(tables.goal_table(evidence))["PCA prior"]["Below the best classical MCE"]
+    assert below.text == "–"
 
 
 # ------------------------------------------------------------------------------------- figures
@@ -479,15 +530,14 @@ def report(tmp_path_factory):
     figure = Figure(figsize=(2, 1))
     figure.subplots().plot([0, 1])
     save_figure(figure, folder / "pca")
-    build_evidence(
+    files = Files(
         written(made_up(few, datasets=("synbench",), seeds=2), folder),
-        folder / "out",
-        methods=methods,
-        searches=[search(folder)],
-        diagnostics=[diagnostics],
-        examples=[Picture("synbench", folder / "pca.png", "A liver.")],
-        config={"note": "<script>alert(1)</script>"},
+        [search(folder)],
+        [diagnostics],
+        [Example("synbench", folder / "pca.png", "A liver.")],
     )
+    config = {"note": "<script>alert(1)</script>", "evaluation": {"training_spread": 0.05}}
+    build_evidence(files, folder / "out", methods=methods, config=config)
     return folder / "out"
 
 
@@ -501,13 +551,22 @@ def test_report_is_one_self_contained_page(report):
     assert len(page.images) == 2 + 1 + 1 + 1 + 1 + 1
     for image in page.images:
         assert "SynBench (synthetic data)" in image["alt"]
-    for title in ("main", "answer", "effects", "corrupted", "plausibility", "seeds", "priors"):
+    for title in ("short", "main", "answer", "corrupted", "plausibility", "seeds", "priors"):
         assert title in page.ids
+    # A figure stands beside the table of its numbers.
+    for name in ("effects", "levels"):
+        assert (
+            report / "figures" / f"{name}_synbench{'_deftransnet' * (name == 'effects')}.png"
+        ).exists()
+    beside = [part.partition("</figure>")[0] for part in text.split('class="beside"')[1:]]
+    assert len(beside) == 3
+    assert all("<table" in part and "<img" in part for part in beside)
     for part in (
         "SynBench: synthetic data.",
         "<b>GP</b> $a$ & $b",
         "<script>alert(1)</script>",
         "CPD (Classical) Coherent point drift.",
+        "varies by 5 % of the reference",
         "PCA prior −12.35 0.0125 –",
         "SynBench (synthetic data): A liver.",
         "dine",
@@ -542,42 +601,28 @@ def test_report_writes_tables_and_figures(report):
 def test_parts_without_data_are_left_out(tmp_path):
     metrics = made_up({"lambda0": 1.0, "pca": 0.9}, datasets=("liver",), seeds=1, corrupted=False)
     metrics = metrics[metrics["backbone"] == "deftransnet"].assign(origin="path")
-    build_evidence(written(metrics, tmp_path), tmp_path / "out", methods={})
+    build_evidence(Files(written(metrics, tmp_path)), tmp_path / "out", methods={})
     page = Page((tmp_path / "out" / "report.html").read_text(encoding="utf-8"))
     assert {"corrupted", "seeds", "priors", "examples"}.isdisjoint(page.ids)
     assert {"main", "answer", "methods"} <= page.ids
     assert "synthetic" not in page.words
     assert "Configuration" not in page.words
-    assert "How much another training would differ: Every network was trained once." in page.words
+    assert "how much another training would differ" in page.words
 
 
 def test_files_of_unknown_datasets_are_refused(tmp_path):
     metrics = made_up({"lambda0": 1.0, "pca": 0.9}, datasets=("d",), seeds=1, corrupted=False)
     paths = written(metrics, tmp_path)
     with pytest.raises(DataError, match="is of synbench, of which there are no metrics"):
-        build_evidence(paths, tmp_path, methods={}, searches=[search(tmp_path)])
+        build_evidence(Files(paths, [search(tmp_path)]), tmp_path, methods={})
     bad = tmp_path / "bad.json"
     bad.write_text("{}")
     with pytest.raises(DataError, match="lacks dataset"):
-        build_evidence(paths, tmp_path, methods={}, diagnostics=[bad])
-    picture = Picture("moon", tmp_path / "x.png", "")
+        build_evidence(Files(paths, diagnostics=[bad]), tmp_path, methods={})
+    picture = Example("moon", tmp_path / "x.png", "")
     with pytest.raises(DataError, match="is of moon"):
-        build_evidence(paths, tmp_path, methods={}, examples=[picture])
+        build_evidence(Files(paths, examples=[picture]), tmp_path, methods={})
     assert not (tmp_path / "report.html").exists()
-
-
-def test_search_figure_shows_choice_and_control(evidence, tmp_path):
-    values = json.loads(search(tmp_path).read_text())
-    figure = figures.search_figure(evidence, ("synbench", "robust_defreg"), [values], "synthetic")
-    mce, cd, trade = figure.axes
-    assert [line.get_ydata()[0] for line in mce.lines if line.get_linestyle() == "--"] == [0.05]
-    (star,) = [line for line in cd.lines if line.get_marker() == "*"]
-    np.testing.assert_allclose(star.get_ydata(), [1.9])
-    assert trade.get_xlabel() == "Roughness of the field"
-    for row in values["curve"]:
-        del row["roughness"]
-    figure = figures.search_figure(evidence, ("synbench", "robust_defreg"), [values], "synthetic")
-    assert len(figure.axes) == 2
 
 
 def test_backbones_of_the_evidence_alone_decide_nothing():
@@ -597,8 +642,9 @@ def test_backbones_of_the_evidence_alone_decide_nothing():
     assert aside.ranking(methods, "mce").equals(plain.ranking(methods, "mce"))
     assert len(counted.ranking(methods, "mce")) < len(plain.ranking(methods, "mce"))
     assert set(aside.goal["backbone"]) == set(plain.goal["backbone"])
-    assert "on_trial, with few methods or pairs, does not count" in said(aside)
-    assert "few methods were tried" not in said(plain)
+    caption = tables.basis_table(aside).caption
+    assert "SynBench, on_trial: shown, but with few methods or pairs" in caption
+    assert "few methods or pairs" not in tables.basis_table(plain).caption
 
 
 def test_test_sets_are_shown_and_decide_nothing():
@@ -610,22 +656,28 @@ def test_test_sets_are_shown_and_decide_nothing():
     assert aside.judged == plain.places
     assert aside.ranking(list(METHODS), "cd").equals(plain.ranking(list(METHODS), "cd"))
     assert aside.goal.equals(plain.goal)
-    assert "scans, with few methods or pairs, does not count" in said(aside)
+    table = tables.basis_table(aside)
+    assert "scans, DefTransNet: shown, but with few methods or pairs" in table.caption
+    assert [row[-1].text for row in table.rows] == ["yes", "yes", "no"]
     assert "data supplied by the user" in aside.where("scans")
 
 
-def test_targets_of_other_points_have_a_sentence_of_their_own():
+def test_targets_of_other_points_have_verdicts_of_their_own():
     """There, another method wins than where points are shared."""
     metrics = made_up(seeds=1)
     other = metrics["condition"] == "resampled"
     means = metrics[other].groupby(["dataset", "backbone", "method"])["mce"].mean()
     best = metrics["method"] == "cpd"
     metrics.loc[other & best, "mce"] = 0.001 * means.min()
-    text = said(Evidence(metrics, METHODS))
+    evidence = Evidence(metrics, METHODS)
     value = metrics.loc[other & best, "mce"].mean()
-    part = text[text.index("Where targets were sampled anew") :].split(" | ")[1]
-    assert part.startswith(f"DeformedTissue (synthetic data), Robust-DefReg: CPD {value:.4f}")
+    place = ("deformedtissue", "robust_defreg")
+    cells = shown(tables.verdict_table(evidence, place))["CPD"]
+    assert cells["Mean correspondence error Clean targets"].text.startswith("higher: +3")
+    assert cells["Mean correspondence error Other points"].text.startswith("lower: −100 %")
+    cells = shown(tables.mean_table(evidence, place, "mce", corrupted=True))
+    group = "Other points (level 0.6) MCE"
+    assert cells["CPD"][group].text == f"{value:.4f} ▼"
+    assert [name for name, row in cells.items() if row[group].bold] == ["CPD"]
     reference = means["deformedtissue", "robust_defreg", "lambda0"]
-    assert f"{reference:.4f}" in part
-    clean = metrics[metrics["condition"] == "deformation"]
-    assert "sampled anew" not in said(Evidence(clean, METHODS))
+    assert cells["λ = 0 (reference)"][group].text == f"{reference:.4f}"

@@ -103,31 +103,29 @@ def test_distance_figure_of_noise_and_of_other_data(metrics):
         figures.distance_figure("liver", own, "outliers")
 
 
-def test_tail_shares_use_stage_one_as_yardstick():
-    errors = {"pca": np.linspace(0, 50, 1001), "stage1": np.linspace(0, 100, 1001)}
-    threshold, shares = figures.tail_shares(errors)
-    assert threshold == pytest.approx(99)
-    assert shares == {"pca": 0, "stage1": pytest.approx(10 / 1001)}
-    assert figures.tail_shares(errors, 25)[1]["pca"] == pytest.approx(500 / 1001)
-
-
 def test_histogram_counts_every_point_and_prints_the_tail():
     rng = np.random.default_rng(1)
     errors = {name: rng.exponential(1e-4, (4, 500)) for name in METHODS}
-    errors["stage1"][0, 0] = 1.0
-    figure = figures.histogram_figure(errors, "Point errors", "synthetic", threshold=3e-4)
+    errors["stage1"] = np.linspace(0, 4e-4, 2000).reshape(4, 500)
+    errors["lambda0"][0, 0] = 1.0
+    figure = figures.histogram_figure(errors, "Point errors", "synthetic")
     axes = figure.axes[0]
     assert axes.get_yscale() == "log"
     # Far strays land in the last bin instead of stretching the axis.
     assert axes.get_xlim()[1] < 1e4
-    share = 100 * np.mean(errors["pca"] > 3e-4)
+    # Stage 1 is the yardstick: 1 % of its points lie above.
     text = all_text(figure)
+    assert "Tail above 3.96 ×10⁻⁴" in text
+    assert "Stage 1: 1.00 % above" in text
+    share = 100 * np.mean(errors["pca"] > 3.96e-4)
     assert f"DINE-PCA: {share:.2f} % above" in text
-    assert "Tail above 3 ×10⁻⁴" in text
     assert "synthetic data" in text
     outlines = [patch.get_xy()[:, 1] for patch in axes.patches]
     assert [sum(heights[1:-1:2]) for heights in outlines] == [2000] * 3
-    assert all(heights.max() < 500 for heights in outlines)
+    del errors["stage1"]
+    first = 100 * np.percentile(errors["lambda0"], 99)
+    text = all_text(figures.histogram_figure(errors, "", "synthetic"))
+    assert f"Tail above {100 * first:.4g}" in text
 
 
 # ---------------------------------------------------------------------------- qualitative
@@ -238,23 +236,36 @@ def search():
     }
 
 
-def test_lambda_figure_marks_choice_and_control(search):
-    figure = figures.lambda_figure(search, "synthetic")
-    left, right = figure.axes
+def test_search_figure_marks_choice_and_control(search):
+    figure = figures.search_figure([search], "SynBench", "synthetic")
+    right, left = figure.axes
     assert left.get_xscale() == "log"
-    curve = lines(left)["DINE-PCA"]
-    assert list(curve.get_xdata()) == [1e-4, 1e-3]
+    # Priors are named beside the first panel.
+    assert list(lines(right)["DINE-PCA"].get_xdata()) == [1e-4, 1e-3]
     (star,) = [line for line in left.get_lines() if line.get_marker() == "*"]
     assert (list(star.get_xdata()), list(star.get_ydata())) == ([1e-4], [pytest.approx(5)])
     (control,) = [line for line in left.get_lines() if line.get_linestyle() == "--"]
     assert control.get_ydata() == [pytest.approx(9)] * 2
     assert right.get_ylabel() == "Mean correspondence error"
+    assert "Choice of λ: SynBench (synthetic data)" in all_text(figure)
+    assert "lowest CD" in all_text(figure)
 
 
-def test_lambda_figure_without_correspondences(search):
+def test_search_figure_without_correspondences(search):
     for entry in search["curve"]:
         entry["mce"] = None
-    assert len(figures.lambda_figure(search, "path").axes) == 1
+    assert len(figures.search_figure([search], "", "path").axes) == 1
+
+
+def test_search_figure_shows_errors_against_roughness_where_it_is_known(search):
+    for entry in search["curve"]:
+        entry["roughness"] = 0.4 - entry["mce"]
+    trade = figures.search_figure([search], "", "path", {"pca": "The <prior> $1"}).axes[2]
+    assert trade.get_xlabel() == "Roughness of the field"
+    curve, star = trade.get_lines()[1:]
+    np.testing.assert_allclose(curve.get_xdata(), [0.2, 0.3, 0.1])
+    np.testing.assert_allclose((star.get_xdata(), star.get_ydata()), ([0.3], [0.1]))
+    assert lines(trade)["λ = 0"].get_ydata() == [pytest.approx(0.2)]
 
 
 def test_training_figure_draws_what_there_is():

@@ -1,4 +1,5 @@
 import base64
+import io
 import re
 from html.parser import HTMLParser
 
@@ -6,9 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image, ImageChops, ImageStat
 
 from dine.errors import DataError
-from dine.reporting import figures, html, tables
+from dine.reporting import figures, html, report
 from dine.reporting.effects import effects, headlines, overview
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -81,56 +83,73 @@ def figure(tmp_path):
     return figures.save_figure(drawing, tmp_path / "drawing")[0]
 
 
-def report(tmp_path, metrics, figures=(), **options):
-    path = html.write_report(
-        tmp_path / "report.html", metrics, tables.all_tables(metrics), figures, **options
-    )
+def page(tmp_path, metrics, pictures=None, more=(), *, spread=0.0):
+    """The text of a report: of results, and whatever sections more."""
+    sections = [*report.result_sections(metrics, pictures, spread), *more]
+    banners = html.banners(metrics, published=True)
+    path = html.write_page(tmp_path / "report.html", "A run", report.INTRO, banners, sections)
     return path.read_text(encoding="utf-8")
 
 
-def full_report(tmp_path, figure, metrics):
-    return report(
-        tmp_path,
-        metrics,
-        [html.ReportFigure("Level <figures>", "A line & more", figure)],
-        index_agreement={"Median distance": 0.123456, "Pairs": 12},
-        lambda_searches=[
-            {
-                "dataset": "deformedtissue",
-                "backbone": "robust_defreg",
-                "selected": {"pca": 1e-4},
-                "curve": [
-                    {"prior": "pca", "lambda": 0, "cd": 9e-4, "mce": 0.2},
-                    {"prior": "pca", "lambda": 1e-4, "cd": 5e-4, "mce": None},
-                ],
-            }
+def full_page(tmp_path, figure, metrics):
+    search = {
+        "dataset": "deformedtissue",
+        "backbone": "robust_defreg",
+        "selected": {"pca": 1e-4},
+        "curve": [
+            {"prior": "pca", "lambda": 0, "cd": 9e-4, "mce": 0.2},
+            {"prior": "pca", "lambda": 1e-4, "cd": 5e-4, "mce": None},
         ],
-        config={"data": {"origin": "synthetic"}, "note": "<script>alert(1)</script>"},
-        versions={"dine": "0.1.0"},
-        step_seconds={"stage1": 3725, "pca": 61, "tables": 1.26},
-        files={"Table 1": "tables/table1.csv"},
-    )
+    }
+    config = {"data": {"origin": "synthetic"}, "note": "<script>alert(1)</script>"}
+    pictures = {
+        "Level <figures>": [("training_x", html.Picture("A line & more", figure))],
+        "Accuracy": [
+            ("distance_deformedtissue_deformation", html.Picture("Beside Table 1", figure))
+        ],
+    }
+    more = [
+        report.lambda_section([search]),
+        report.agreement_section([{"dataset": "liver", "Median distance": 0.123456, "Pairs": 12}]),
+        html.Section(
+            "how",
+            "How it was made",
+            [
+                html.as_yaml(config),
+                html.grid(["Package", "Version"], {"dine": "0.1.0"}.items()),
+                html.Part("links", {"Table 1": "tables/table1.csv"}),
+            ],
+        ),
+    ]
+    return page(tmp_path, metrics, pictures, more)
 
 
 def test_report_is_one_self_contained_page(tmp_path, figure):
-    text = full_report(tmp_path, figure, made_up(0.25))
-    page = Page(text)
+    text = full_page(tmp_path, figure, made_up(0.25))
+    found = Page(text)
     assert "script" not in re.findall(r"<(\w+)", text)
     assert not re.search(r"url\(|@import|<link", text)
-    for address in page.addresses:
+    for address in found.addresses:
         if address.startswith("#"):
-            assert address[1:] in page.ids
+            assert address[1:] in found.ids
         else:
             assert address.startswith("data:image/png;base64,") or address == "tables/table1.csv"
-    (image,) = page.images
-    assert base64.b64decode(image["src"].partition(",")[2]) == figure.read_bytes()
+    beside, image = found.images
+    # In fewer colours, which nobody sees.
+    stream = io.BytesIO(base64.b64decode(image["src"].partition(",")[2]))
+    with Image.open(stream) as shown, Image.open(figure) as drawn:
+        difference = ImageChops.difference(shown.convert("RGB"), drawn.convert("RGB"))
+        assert max(ImageStat.Stat(difference).mean) < 1
     # 4 inches at 96 CSS pixels, whatever the resolution of the file.
     assert image["width"] == "384"
-    assert image["alt"] == "A line & more"
+    assert (beside["alt"], image["alt"]) == ("Beside Table 1", "A line & more")
+    # Next to the table that holds its numbers.
+    next_to = text.partition('id="table1"')[2].partition("<h3")[0]
+    assert "Beside Table 1" in next_to
 
 
 def test_report_holds_every_part(tmp_path, figure):
-    words = Page(full_report(tmp_path, figure, made_up(0.25))).words
+    words = Page(full_page(tmp_path, figure, made_up(0.25))).words
     for part in (
         "DeformedTissue: synthetic data.",
         "not comparable in absolute terms",
@@ -138,32 +157,38 @@ def test_report_holds_every_part(tmp_path, figure):
         "Outliers and noise: DeformedTissue (Table 3 of the paper)",
         "39.49 ± 6.61",
         "Level <figures>",
-        "Median distance 0.1235 Pairs 12",
+        "dataset Median distance Pairs liver 0.1235 12",
         "DINE-PCA 0.0001 5 – 9 0.2",
         "<script>alert(1)</script>",
         "dine 0.1.0",
-        "stage1 1 h 02 min pca 1 min 01 s tables 1.3 s",
     ):
         assert part in words, part
 
 
-def test_optional_parts_can_be_left_out(tmp_path):
-    page = Page(report(tmp_path, made_up(0.25)))
-    for part in ("Choice of λ", "point indices", "Configuration", "Versions", "Figures", "Files"):
-        assert part not in page.words
-    assert {"figures", "lambda", "indices"}.isdisjoint(page.ids)
+@pytest.mark.parametrize(
+    ("seconds", "said"), [(3725, "1 h 02 min"), (61, "1 min 01 s"), (1.26, "1.3 s")]
+)
+def test_durations(seconds, said):
+    assert report.duration(seconds) == said
+
+
+def test_sections_without_items_are_left_out(tmp_path):
+    found = Page(page(tmp_path, made_up(0.25), more=[report.lambda_section([])]))
+    assert "Choice of λ" not in found.words
+    assert {"figures", "lambda"}.isdisjoint(found.ids)
+    assert {"findings", "tables"} <= found.ids
 
 
 def test_origins_other_than_synthetic(tmp_path):
-    words = Page(report(tmp_path, made_up(0.25, origin="doi"))).words
+    words = Page(page(tmp_path, made_up(0.25, origin="doi"))).words
     assert "synthetic" not in words
     assert "not comparable" not in words
-    words = Page(report(tmp_path, made_up(0.25, origin="bases"))).words
+    words = Page(page(tmp_path, made_up(0.25, origin="bases"))).words
     assert "DeformedTissue: real base meshes with synthetic deformations." in words
 
 
 def test_names_are_escaped(tmp_path):
-    text = report(tmp_path, made_up(0.25, dataset="<b>liver</b>", origin="path"))
+    text = page(tmp_path, made_up(0.25, dataset="<b>liver</b>", origin="path"))
     assert "<b>" not in text
     words = Page(text).words
     assert "<b>liver</b>" in words
@@ -240,12 +265,12 @@ def test_headlines_without_control_or_prior():
 
 
 def test_overview_has_a_column_for_every_condition():
-    header, rows = overview(even(-0.5))
-    assert header == [
+    table = overview(even(-0.5))
+    assert [label for _, label in table.header] == [
         *("Objects", "Dataset", "Backbone", "Prior", "CD, deformation", "CD, noise"),
         *("MCE, deformation", "CD, deformation, against Stage 1"),
     ]
-    assert rows == [
+    assert [[cell.text for cell in row] for row in table.rows] == [
         [
             *("Known objects", "DeformedTissue", "Robust-DefReg", "DINE-PCA"),
             *["higher: +50 % (+50 to +50)"] * 3,
@@ -255,23 +280,29 @@ def test_overview_has_a_column_for_every_condition():
 
 
 def test_the_page_shows_effects_their_chance_and_where_they_were_made(tmp_path):
-    words = Page(report(tmp_path, even(-0.5), spread=0.05, made={"CPU": "a <chip>"})).words
+    made = html.Section("how", "How", [html.grid(["What", "Value"], [("CPU", "a <chip>")])])
+    words = Page(page(tmp_path, even(-0.5), more=[made], spread=0.05)).words
     assert "higher: +50 % (+40 to +60)" in words
     assert "varies by 5 % of the reference" in words
     assert "What Value CPU a <chip>" in words
-    assert "varies by" not in Page(report(tmp_path, even(-0.5))).words
+    assert "varies by" not in Page(page(tmp_path, even(-0.5))).words
 
 
 @pytest.mark.parametrize("address", ["https://example.org/x.csv", "//example.org", "/etc/x"])
 def test_links_must_be_relative(tmp_path, address):
+    links = html.Section("files", "Files", [html.Part("links", {"x": address})])
     with pytest.raises(DataError, match="only by a relative path"):
-        report(tmp_path, made_up(0.25), files={"x": address})
+        page(tmp_path, made_up(0.25), more=[links])
     assert not (tmp_path / "report.html").exists()
 
 
 def test_figures_must_be_png(tmp_path):
+    def with_figure(name):
+        picture = html.Picture("", tmp_path / name)
+        page(tmp_path, made_up(0.25), more=[html.Section("x", "X", [picture])])
+
     with pytest.raises(DataError, match=r"none\.png cannot be read"):
-        report(tmp_path, made_up(0.25), [html.ReportFigure("", "", tmp_path / "none.png")])
+        with_figure("none.png")
     (tmp_path / "text.png").write_text("no image")
     with pytest.raises(DataError, match=r"text\.png is not a PNG image"):
-        report(tmp_path, made_up(0.25), [html.ReportFigure("", "", tmp_path / "text.png")])
+        with_figure("text.png")

@@ -19,7 +19,7 @@ from dine.evaluation.predictions import Prediction, read_predictions
 from dine.evaluation.refined import refine_predictions
 from dine.files import read_json
 from dine.priors import PRIORS
-from dine.reporting.evidence.examples import typical
+from dine.reporting.examples import typical
 
 pytestmark = pytest.mark.numerical
 

@@ -6,6 +6,18 @@ import pytest
 
 from dine.errors import DataError
 from dine.reporting import tables
+from dine.reporting.loading import load_metrics
+from dine.reporting.table import Cell, Table, to_latex, to_markdown, write_table
+
+PAPER_TABLES = {
+    1: ("deformation", "deformedtissue"),
+    2: ("deformation", "synbench"),
+    3: ("corruption", "deformedtissue"),
+}
+
+
+def paper_table(number, metrics, spread=0.0):
+    return tables.mean_table(*PAPER_TABLES[number], metrics, spread)
 
 
 def row(method, pair, cd, **changes):
@@ -76,27 +88,27 @@ def write(path, rows):
 def test_load_metrics_joins_files(tmp_path, metrics):
     first = write(tmp_path / "stage1.csv", metrics.iloc[:6])
     second = write(tmp_path / "rest.csv", metrics.iloc[6:].assign(mce=np.nan, level=np.nan))
-    loaded = tables.load_metrics([first, second])
+    loaded = load_metrics([first, second])
     assert list(loaded["method"]) == ["stage1"] * 6 + ["lambda0"] * 6 + ["pca"] * 6
     assert loaded["mce"].isna().sum() == loaded["level"].isna().sum() == 12
 
 
 def test_load_metrics_keeps_numeric_pair_names_as_text(tmp_path):
     path = write(tmp_path / "m.csv", [row("pca", "007", 1e-4, object="12")])
-    assert tables.load_metrics([path])["pair"].tolist() == ["007"]
+    assert load_metrics([path])["pair"].tolist() == ["007"]
 
 
 def test_missing_columns_are_named_with_the_file(tmp_path, metrics):
     path = write(tmp_path / "short.csv", metrics.drop(columns=["mce", "level"]))
     with pytest.raises(DataError, match=r"short\.csv lacks the column\(s\) level, mce"):
-        tables.load_metrics([path])
+        load_metrics([path])
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"cd": -1e-4}, "column cd holds -0.0001 in data row 2"),
-        ({"cd": np.nan}, "column cd holds nan in data row 2"),
+        ({"cd": np.nan}, "column cd holds nothing in data row 2"),
         ({"cd_unregistered": np.inf}, "column cd_unregistered holds inf"),
         ({"cd": "many"}, "column cd is not numeric"),
         ({"pair": None}, "column pair is empty"),
@@ -109,17 +121,17 @@ def test_missing_columns_are_named_with_the_file(tmp_path, metrics):
 def test_unusable_values_are_refused(tmp_path, changes, message):
     path = write(tmp_path / "bad.csv", [row("pca", "a", 1e-4), row("pca", "b", 1e-4) | changes])
     with pytest.raises(DataError, match=message) as error:
-        tables.load_metrics([path])
+        load_metrics([path])
     assert "bad.csv" in str(error.value)
 
 
 def test_contradicting_files_are_refused(tmp_path, metrics):
     path = write(tmp_path / "m.csv", metrics)
     with pytest.raises(DataError, match=r"the same evaluation twice .*method stage1.*pair a"):
-        tables.load_metrics([path, path])
+        load_metrics([path, path])
     other = write(tmp_path / "o.csv", [row("flow", "a", 1e-4, origin="doi")])
     with pytest.raises(DataError, match=r"different origins \(doi, synthetic\)"):
-        tables.load_metrics([path, other])
+        load_metrics([path, other])
 
 
 @pytest.mark.parametrize("content", [None, "", "dataset,backbone\n", "\x00\xff"])
@@ -128,9 +140,9 @@ def test_unreadable_files_are_refused(tmp_path, content):
     if content is not None:
         path.write_text(content, encoding="latin-1")
     with pytest.raises(DataError, match=r"m\.csv"):
-        tables.load_metrics([path])
+        load_metrics([path])
     with pytest.raises(DataError, match="No metrics files"):
-        tables.load_metrics([])
+        load_metrics([])
 
 
 # --------------------------------------------------------------------------------- numbers
@@ -148,7 +160,7 @@ def test_summary_gives_mean_and_sample_deviation(metrics):
 def test_a_single_pair_has_no_deviation(metrics):
     data = tables.summary(metrics.iloc[:1])
     assert np.isnan(data["std"].item())
-    table = tables.paper_table(1, metrics.iloc[:1])
+    table = paper_table(1, metrics.iloc[:1])
     assert cells(table, "this run", "0.7")["Robust-DefReg", "Stage 1"].text == "18.00"
 
 
@@ -217,24 +229,24 @@ def test_gains_without_control(metrics):
     ],
 )
 def test_published_values_reach_their_place(metrics, number, where, mean, std):
-    data = only(tables.paper_table(number, metrics).data, **where)
+    data = only(paper_table(number, metrics).data, **where)
     assert (data["published_mean_1e-4"], data["published_std_1e-4"]) == (mean, std)
 
 
 def test_every_published_value_appears_once(metrics):
-    counts = [tables.paper_table(n, metrics).data["published_mean_1e-4"].count() for n in (1, 2, 3)]
+    counts = [paper_table(n, metrics).data["published_mean_1e-4"].count() for n in (1, 2, 3)]
     assert counts == [35, 40, 24]
 
 
 def test_ours_stand_beside_the_published(metrics):
-    table = tables.paper_table(1, metrics)
+    table = paper_table(1, metrics)
     data = only(table.data, level=0.7, backbone="robust_defreg", method="stage1")
     assert data["mean_1e-4"] == pytest.approx(20)
     assert data["published_mean_1e-4"] == 39.49
     ours, paper = (cells(table, source, "0.7") for source in ("this run", "paper"))
-    assert ours["Robust-DefReg", "Stage 1"] == tables.Cell("20.00 ± 2.19")
-    assert ours["Robust-DefReg", "DINE-PCA"] == tables.Cell("8.00 ± 3.29", bold=True)
-    assert paper["Robust-DefReg", "Stage 1"] == tables.Cell("39.49 ± 6.61")
+    assert ours["Robust-DefReg", "Stage 1"] == Cell("20.00 ± 2.19")
+    assert ours["Robust-DefReg", "DINE-PCA"] == Cell("8.00 ± 3.29", bold=True)
+    assert paper["Robust-DefReg", "Stage 1"] == Cell("39.49 ± 6.61")
     assert ours["", "Unregistered"].text == "100.00 ± 0.00"
     assert ours["", "Pairs"].text == "6"
     # What one side lacks is a dash there, not a missing row or column.
@@ -246,7 +258,7 @@ def test_ours_stand_beside_the_published(metrics):
 
 
 def test_levels_outside_the_paper_appear(metrics):
-    table = tables.paper_table(1, metrics.assign(level=0.75))
+    table = paper_table(1, metrics.assign(level=0.75))
     assert cells(table, "this run", "0.75")["Robust-DefReg", "Stage 1"].text == "20.00 ± 2.19"
     assert cells(table, "paper", "0.75")["Robust-DefReg", "Stage 1"].text == "–"
     assert [line[0].text for line in table.rows[::2]][-2:] == ["0.7", "0.75"]
@@ -261,7 +273,7 @@ def test_bold_is_what_is_decided_to_be_lower_than_the_control_of_its_backbone(me
     worse = metrics.assign(backbone="deftransnet", cd=metrics["cd"] / 10)
     worse.loc[worse["method"] == "pca", "cd"] = 50e-4
     lone = metrics[metrics["method"] == "pca"].assign(backbone="lonely")
-    table = tables.paper_table(1, pd.concat([metrics, worse, lone]))
+    table = paper_table(1, pd.concat([metrics, worse, lone]))
     assert verdicts(table.data) == {
         ("robust_defreg", "stage1"): "higher",
         ("robust_defreg", "pca"): "lower",
@@ -274,19 +286,19 @@ def test_bold_is_what_is_decided_to_be_lower_than_the_control_of_its_backbone(me
 def test_what_chance_explains_is_not_bold(metrics):
     # −46.7 ± 13.3 % is decided, until trainings differ by 30 % (± 58.8 %).
     bold = [
-        sum(cell.bold for line in tables.paper_table(1, metrics, spread).rows for cell in line)
+        sum(cell.bold for line in paper_table(1, metrics, spread).rows for cell in line)
         for spread in (0.0, 0.3)
     ]
     assert bold == [1, 0]
     metrics.loc[metrics["method"] == "pca", "cd"] = [11e-4, 5e-4] * 3
-    data = tables.paper_table(1, metrics).data
+    data = paper_table(1, metrics).data
     assert verdicts(data)["robust_defreg", "pca"] == "undecided"
 
 
 def test_unseen_objects_are_shown_as_a_dataset_of_their_own(tmp_path, metrics):
     unseen = metrics.assign(pair="u" + metrics["pair"], objects="unseen", cluster="u")
     path = write(tmp_path / "m.csv", pd.concat([metrics, unseen]))
-    loaded = tables.load_metrics([path])
+    loaded = load_metrics([path])
     kinds = loaded.groupby("dataset")["objects"].unique().map(list).to_dict()
     assert kinds == {"deformedtissue": ["known"], "deformedtissue_unseen": ["unseen"]}
     made = {table.name: table for table in tables.all_tables(loaded)}
@@ -298,9 +310,9 @@ def test_unseen_objects_are_shown_as_a_dataset_of_their_own(tmp_path, metrics):
     # Of one object nothing is decided.
     assert set(verdicts(made["deformation_deformedtissue_unseen"].data).values()) == {"undecided"}
     # Where there are no others, they are the dataset.
-    alone = tables.load_metrics([write(tmp_path / "u.csv", unseen)])
+    alone = load_metrics([write(tmp_path / "u.csv", unseen)])
     assert set(alone["dataset"]) == {"deformedtissue"}
-    assert "DeformedTissue, unseen objects;" in tables.paper_table(1, alone).caption
+    assert "DeformedTissue, unseen objects;" in paper_table(1, alone).caption
 
 
 def test_table_three_pools_levels_and_matches_percent_and_sigma(metrics):
@@ -311,7 +323,7 @@ def test_table_three_pools_levels_and_matches_percent_and_sigma(metrics):
             metrics.assign(condition="noise", corruption=np.float32(0.03)),
         ]
     )
-    table = tables.paper_table(3, corrupted)
+    table = paper_table(3, corrupted)
     for corruption, published in ((25.0, 26), (0.03, 33)):
         data = only(table.data, corruption=corruption, backbone="robust_defreg", method="stage1")
         assert (data["n"], data["published_mean_1e-4"]) == (6, published)
@@ -322,7 +334,7 @@ def test_table_three_pools_levels_and_matches_percent_and_sigma(metrics):
 
 
 def test_a_table_without_own_results_says_so(metrics):
-    table = tables.paper_table(2, metrics)
+    table = paper_table(2, metrics)
     assert table.caption.startswith("This run has no results on SynBench")
     assert {cell.text for line in table.rows[::2] for cell in line[2:]} == {"–"}
     assert cells(table, "paper", "0.8")["DefTransNet", "DINE-Flow"].text == "2.12 ± 2.04"
@@ -331,13 +343,13 @@ def test_a_table_without_own_results_says_so(metrics):
 def test_other_methods_and_backbones_get_columns(metrics):
     other = metrics.assign(backbone="mynet")
     other.loc[other["method"] == "pca", "method"] = "pca_16"
-    header = tables.paper_table(1, pd.concat([metrics, other])).header
+    header = paper_table(1, pd.concat([metrics, other])).header
     assert header[-3:] == (("mynet", "Stage 1"), ("mynet", "Control (λ = 0)"), ("mynet", "pca_16"))
 
 
 def test_other_datasets_have_no_published_columns(metrics):
     own = metrics.assign(dataset="liver", origin="path", level=np.nan)
-    table = tables.deformation_table("liver", own)
+    table = tables.mean_table("deformation", "liver", own)
     assert ("", "Values") not in table.header
     assert [cell.text for cell in table.rows[0]][:2] == ["not given", "6"]
     assert len(table.rows) == 1
@@ -360,7 +372,7 @@ def test_other_datasets_have_no_published_columns(metrics):
 )
 def test_captions_tell_the_origin(metrics, origin, start):
     metrics = metrics.assign(origin=origin)
-    assert tables.paper_table(1, metrics).caption.startswith(start)
+    assert paper_table(1, metrics).caption.startswith(start)
     if origin == "synthetic":
         for table in tables.all_tables(metrics):
             assert "synthetic data" in table.caption
@@ -374,9 +386,9 @@ def test_supplementary_tables(metrics):
         *("table1", "table3", "gains_deformedtissue"),
         *("observed_deformedtissue", "correspondence_deformedtissue"),
     ]
-    data = tables.observed_table("deformedtissue", everything).data
+    data = tables.mean_table("observed", "deformedtissue", everything).data
     assert only(data, method="stage1")["mean_1e-4"] == pytest.approx(40)
-    data = tables.correspondence_table("deformedtissue", everything).data
+    data = tables.mean_table("correspondence", "deformedtissue", everything).data
     assert only(data, method="stage1", condition="noise")["mean"] == pytest.approx(20e-3)
     without = everything.assign(mce=np.nan)
     assert "correspondence_deformedtissue" not in [t.name for t in tables.all_tables(without)]
@@ -384,7 +396,7 @@ def test_supplementary_tables(metrics):
 
 def test_correspondence_errors_count_only_pairs_that_have_them(metrics):
     metrics.loc[metrics["pair"].str.startswith("b"), "mce"] = np.nan
-    data = tables.correspondence_table("deformedtissue", metrics).data
+    data = tables.mean_table("correspondence", "deformedtissue", metrics).data
     assert only(data, method="stage1")["n"] == 3
 
 
@@ -392,8 +404,8 @@ def test_correspondence_errors_count_only_pairs_that_have_them(metrics):
 
 
 def test_write_table_writes_three_formats(tmp_path, metrics):
-    table = tables.paper_table(1, metrics)
-    paths = tables.write_table(table, tmp_path / "table1")
+    table = paper_table(1, metrics)
+    paths = write_table(table, tmp_path / "table1")
     assert [path.name for path in paths] == ["table1.csv", "table1.md", "table1.tex"]
     tidy = only(
         pd.read_csv(paths[0]), level=0.7, backbone="robust_defreg", method="pca", origin="synthetic"
@@ -415,18 +427,18 @@ def test_write_table_writes_three_formats(tmp_path, metrics):
 
 
 def test_special_characters_are_escaped():
-    table = tables.Table(
+    table = Table(
         name="Odd Näme_1",
         title="50 % of a_b & c",
         caption=r"#1 {x} $y \z ~ ^",
         header=(("", "L|vl"), ("g_1", "m*")),
-        rows=((tables.Cell("–"), tables.Cell("σ = 5 %", bold=True)),),
+        rows=((Cell("–"), Cell("σ = 5 %", bold=True)),),
         data=pd.DataFrame({"x": [1]}),
     )
-    latex = tables.to_latex(table)
+    latex = to_latex(table)
     assert r"50 \% of a\_b \& c" in latex
     assert r"\#1 \{x\} \$y \textbackslash{}z \textasciitilde{} \textasciicircum{}" in latex
     assert r"-- & \textbf{$\sigma$ = 5 \%} \\" in latex
     assert r"\label{tab:odd-n-me-1}" in latex
-    markdown = tables.to_markdown(table)
+    markdown = to_markdown(table)
     assert r"| L\|vl | g\_1: m\* |" in markdown

@@ -27,7 +27,11 @@ SUMMARISED = (
 FEWEST_CLUSTERS = 5
 """With fewer, an interval from drawing them anew says next to nothing."""
 
+SIGNIFICANT = 0.05
+
 _GROUP = ["dataset", "backbone", "condition", "corruption"]
+_VERDICT = [*_GROUP, "level", "method", "pairs", "clusters", "mean_method", "mean_reference"]
+_COMPARED = [*_VERDICT, "relative", "value"]
 _PAIR = ["pair", "object", "cluster", "level"]
 _NEEDED = ["dataset", "backbone", "method", "seed", *_PAIR, "condition", "corruption"]
 # Levels and corruptions that passed through float32 must still meet; real ones lie far apart.
@@ -394,6 +398,72 @@ def compare(
     )
 
 
+def comparisons(
+    metrics: pd.DataFrame, reference: str, values: Sequence[str] = ("cd", "mce")
+) -> pd.DataFrame:
+    """:func:`compare` of every method with a reference, within each dataset and backbone.
+
+    On the pairs that both were evaluated on, since slow methods may have seen fewer. Methods of the
+    backbone ``none`` are compared at every backbone of their dataset. Empty where the reference
+    was not evaluated beside any other method.
+
+    Args:
+        metrics: rows of ``metrics.csv``.
+        reference: the method that the others are compared with.
+        values: columns to compare.
+
+    Raises:
+        DataError: see :func:`paired`.
+    """
+    found = []
+    for _, rows in metrics.groupby("dataset", sort=False):
+        backbones = [x for x in rows["backbone"].unique() if x != NO_BACKBONE]
+        for backbone in backbones or [NO_BACKBONE]:
+            here = rows[rows["backbone"].isin([backbone, NO_BACKBONE])]
+            for method in here["method"].unique():
+                some = here[here["method"].isin([method, reference])]
+                keys = ["condition", "corruption", "pair"]
+                shared = some.groupby(keys)["method"].transform("nunique") == 2
+                if shared.any():
+                    found.append(compare(some[shared], method, reference, values=values))
+    return pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=_COMPARED)
+
+
+def decided(table: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
+    """What follows from each row of :func:`comparisons`: ``low``, ``high`` and ``verdict``.
+
+    ``low`` to ``high`` is the 95 % interval of ``relative``, in percent of the reference's mean;
+    ``verdict`` is ``lower`` or ``higher`` where that holds no zero, otherwise ``undecided``.
+
+    The interval joins two sources of chance as independent: that of the pairs
+    (:func:`cluster_bootstrap`, widened for n clusters by t / 1.96 · √(n / (n − 1)) with the 97.5 %
+    quantile t of n − 1 degrees of freedom: Hesterberg (2015), The American Statistician 69,
+    section 5.3), and that of the training, as another seed or the rounding of another CPU gives
+    another network from the same data: ± 1.96 ``spread`` / √(number of seeds). With fewer than
+    ``FEWEST_CLUSTERS`` there is no interval, and nothing is decided.
+    """
+    percent = 100 / table["mean_reference"].where(table["mean_reference"] > 0)
+    chance = 1.96 * 100 * spread / np.sqrt(table[["seeds_method", "seeds_reference"]].min(axis=1))
+    clusters = table["clusters"].where(table["clusters"] >= FEWEST_CLUSTERS)
+    wider = stats.t.ppf(0.975, clusters - 1) / 1.96 * np.sqrt(clusters / (clusters - 1))
+    low, high = (
+        table["relative"]
+        + sign * np.hypot((table[end] - table["difference"]) * percent * wider, chance)
+        for sign, end in ((-1, "ci_low"), (1, "ci_high"))
+    )
+    verdict = np.select([high < 0, low > 0], ["lower", "higher"], "undecided")
+    return pd.DataFrame({"low": low, "high": high, "verdict": verdict})
+
+
+def significant(table: pd.DataFrame) -> np.ndarray:
+    """``lower`` or ``higher`` by row of :func:`comparisons` where p < 0.05 after Holm, or ``none``.
+
+    Unlike :func:`decided` it says nothing about how other trainings would differ.
+    """
+    sure = (table["p_holm"] < SIGNIFICANT) & (table["difference"] != 0)
+    return np.select([sure & (table["difference"] < 0), sure], ["lower", "higher"], "none")
+
+
 def verdicts(
     metrics: pd.DataFrame, reference: str, value: str = "cd", *, spread: float = 0.0
 ) -> pd.DataFrame:
@@ -402,15 +472,7 @@ def verdicts(
     One row per dataset, backbone, method, condition, corruption and deformation level, and of all
     levels together, whose ``level`` is NaN; columns beside these: ``pairs``, ``clusters``,
     ``mean_method``, ``mean_reference``, and, in percent of the reference's mean, ``relative`` and
-    its 95 % interval ``low`` to ``high``. ``verdict`` is ``lower`` or ``higher`` where that holds
-    no zero, otherwise ``undecided``.
-
-    The interval joins two sources of chance as independent: that of the pairs
-    (:func:`cluster_bootstrap`, widened for n clusters by t / 1.96 · √(n / (n − 1)) with the 97.5 %
-    quantile t of n − 1 degrees of freedom: Hesterberg (2015), The American Statistician 69,
-    section 5.3), and that of the training, as another seed or the rounding of another CPU gives
-    another network from the same data: ± 1.96 ``spread`` / √(number of seeds). With fewer than
-    ``FEWEST_CLUSTERS`` there is no interval, and nothing is decided.
+    what :func:`decided` says: its interval ``low`` to ``high`` and the ``verdict``.
 
     Args:
         metrics: rows of ``metrics.csv``.
@@ -422,32 +484,10 @@ def verdicts(
     Raises:
         DataError: see :func:`paired`.
     """
-    found = []
-    for _, rows in metrics.groupby(["dataset", "backbone"], sort=False):
-        methods = [name for name in rows["method"].unique() if name != reference]
-        if len(methods) == len(rows["method"].unique()):
-            continue
-        for method in methods:
-            some = rows[rows["method"].isin([method, reference])]
-            keys = ["condition", "corruption", "pair"]
-            count = some.groupby(keys)["method"].transform("nunique")
-            if (count == 2).any():
-                found.append(compare(some[count == 2], method, reference, values=(value,)))
-    columns = [*_GROUP, "level", "method", "pairs", "clusters", "mean_method", "mean_reference"]
-    if not found:
-        return pd.DataFrame(columns=[*columns, "relative", "low", "high", "verdict"])
-    table = pd.concat(found, ignore_index=True)
-    percent = 100 / table["mean_reference"].where(table["mean_reference"] > 0)
-    chance = 1.96 * 100 * spread / np.sqrt(table[["seeds_method", "seeds_reference"]].min(axis=1))
-    clusters = table["clusters"].where(table["clusters"] >= FEWEST_CLUSTERS)
-    wider = stats.t.ppf(0.975, clusters - 1) / 1.96 * np.sqrt(clusters / (clusters - 1))
-    low, high = (
-        table["relative"]
-        + sign * np.hypot((table[end] - table["difference"]) * percent * wider, chance)
-        for sign, end in ((-1, "ci_low"), (1, "ci_high"))
+    table = comparisons(metrics, reference, (value,))
+    return table[[*_VERDICT, "relative"]].join(
+        decided(table, spread) if len(table) else pd.DataFrame(columns=["low", "high", "verdict"])
     )
-    verdict = np.select([high < 0, low > 0], ["lower", "higher"], "undecided")
-    return table[[*columns, "relative"]].assign(low=low, high=high, verdict=verdict)
 
 
 def _levels(rows: pd.DataFrame) -> Iterable[tuple[float, pd.DataFrame]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,8 @@ from dine.data.pairs import read_pairs
 from dine.files import read_json
 from dine.priors import PCAPrior, load_prior
 from dine.reporting import figures as draw
-from dine.reporting.tables import display_name, load_metrics, origin_of
+from dine.reporting.loading import load_metrics, origin_of
+from dine.reporting.names import display_name
 from dine.results import CLEAN, Results, figure_names, own_searches, pca_priors, runs, strengths
 
 HISTORY_WINDOW = 20
@@ -27,10 +29,19 @@ class Run:
     def __init__(self, results: Path, config: Config):
         self.files = Results(results)
         self.config = config
-        self.metrics = load_metrics(self.metric_files())
-
-    def metric_files(self) -> list[Path]:
-        return [self.files.run(*run).metrics for run in runs(self.config)]
+        self.metrics = load_metrics(self.files.run(*run).metrics for run in runs(config))
+        typical = "the median Stage-1 case at the largest level, coloured by error"
+        errors = "distribution of per-point squared distances, clean targets"
+        self._kinds = [
+            ("qualitative", "Before and after", typical, self.qualitative),
+            ("histogram", "Per-point errors", errors, self.histogram),
+            ("training", "Training", "training curves", self.training),
+        ]
+        explained = "variance explained by the components"
+        self._kinds_of_priors = [
+            ("spectrum", "The PCA prior", explained, self.spectrum),
+            ("modes", "The PCA prior", "the first modes", self.modes),
+        ]
 
     def origin(self, dataset: str) -> str:
         return origin_of(dataset, self.metrics)
@@ -41,9 +52,6 @@ class Run:
             for method in self.config.methods(backbone)
         }
 
-    def distance(self, dataset: str, condition: str) -> Figure:
-        return draw.distance_figure(dataset, self.metrics, condition)
-
     def qualitative(self, dataset: str, backbone: str) -> Figure:
         pairs = read_pairs(self.files.data(dataset).pairs, split="test")
         examples = draw.load_examples(
@@ -52,16 +60,14 @@ class Run:
             self._per_method(dataset, backbone, "predictions"),
             self._per_method(dataset, backbone, "point_errors"),
         )
-        return draw.qualitative_figure(
-            examples, self._title(dataset, backbone), self.origin(dataset)
-        )
+        return draw.qualitative_figure(examples, _title(dataset, backbone), self.origin(dataset))
 
     def histogram(self, dataset: str, backbone: str) -> Figure:
         errors = {
             method: draw.read_group(path, CLEAN, "squared_distance")[1]
             for method, path in self._per_method(dataset, backbone, "point_errors").items()
         }
-        title = f"{self._title(dataset, backbone)}: per-point error, all levels"
+        title = f"{_title(dataset, backbone)}: per-point error, all levels"
         return draw.histogram_figure(errors, title, self.origin(dataset))
 
     def training(self, dataset: str, backbone: str) -> Figure:
@@ -73,17 +79,14 @@ class Run:
             if not frame["penalty"].any():
                 frame["penalty"] = np.nan
             histories[method] = frame.drop(columns=["learning_rate", "seconds"])
-        title = f"{self._title(dataset, backbone)}: training (mean over {HISTORY_WINDOW} steps)"
+        title = f"{_title(dataset, backbone)}: training (mean over {HISTORY_WINDOW} steps)"
         return draw.training_figure(histories, title, self.origin(dataset))
 
     def spectrum(self, dataset: str, backbone: str, name: str) -> Figure:
-        prior = self._pca(dataset, backbone, name)
-        return draw.pca_spectrum_figure(
-            np.array(prior.notes["explained_variance"]),
-            np.array(prior.notes["explained_variance_ratio"]),
-            f"{self._title(dataset, backbone)}: PCA prior ({prior.notes['samples']} fields)",
-            self.origin(dataset),
-        )
+        notes = self._pca(dataset, backbone, name).notes
+        title = f"{_title(dataset, backbone)}: PCA prior ({notes['samples']} fields)"
+        variance = (np.array(notes[f"explained_variance{x}"]) for x in ("", "_ratio"))
+        return draw.pca_spectrum_figure(*variance, title, self.origin(dataset))
 
     def modes(self, dataset: str, backbone: str, name: str) -> Figure:
         prior = self._pca(dataset, backbone, name)
@@ -93,9 +96,12 @@ class Run:
             prior.modes(),
             np.array(prior.notes["explained_variance"]),
             source,
-            f"{self._title(dataset, backbone)}: first modes of the PCA prior",
+            f"{_title(dataset, backbone)}: first modes of the PCA prior",
             self.origin(dataset),
         )
+
+    def _pca(self, dataset: str, backbone: str, name: str) -> PCAPrior:
+        return load_prior(self.files.prior(dataset, backbone, name))
 
     def searches(self) -> dict[str, Path]:
         """The files of all searches of λ, by the figures drawn of them."""
@@ -103,14 +109,9 @@ class Run:
         return {"lambda": self.files.search, **own}
 
     def search(self, path: Path) -> Figure:
-        return draw.lambda_figure(read_json(path), self.origin(self.config.lambda_search.dataset))
-
-    def _pca(self, dataset: str, backbone: str, name: str) -> PCAPrior:
-        return load_prior(self.files.prior(dataset, backbone, name))
-
-    @staticmethod
-    def _title(dataset: str, backbone: str) -> str:
-        return f"{display_name(dataset)}, {display_name(backbone)}"
+        search = read_json(path)
+        where = _title(search["dataset"], search["backbone"])
+        return draw.search_figure([search], where, self.origin(search["dataset"]))
 
     def all_figures(self) -> dict[str, tuple[str, str, Callable[[], Figure]]]:
         """Section of the report, caption and drawing function of every figure, by file stem."""
@@ -118,44 +119,27 @@ class Run:
         for dataset in self.config.datasets:
             shown = display_name(dataset)
             for kind in (CLEAN, *strengths(self.config, dataset)):
-                found[f"distance_{dataset}_{kind}"] = (
-                    f"Accuracy on {shown}",
-                    f"Mean Chamfer distance on {shown}.",
-                    lambda d=dataset, k=kind: self.distance(d, k),
-                )
+                make = partial(draw.distance_figure, dataset, self.metrics, kind)
+                caption = f"Mean Chamfer distance on {shown}."
+                found[f"distance_{dataset}_{kind}"] = (f"Accuracy on {shown}", caption, make)
             for backbone in self.config.backbones_of(dataset):
-                key = f"{dataset}_{backbone}"
-                here = f"{shown}, {display_name(backbone)}"
-                found[f"qualitative_{key}"] = (
-                    "Before and after",
-                    f"{here}: the median Stage-1 case at the largest level, coloured by error.",
-                    lambda d=dataset, b=backbone: self.qualitative(d, b),
-                )
-                found[f"histogram_{key}"] = (
-                    "Per-point errors",
-                    f"{here}: distribution of per-point squared distances, clean targets.",
-                    lambda d=dataset, b=backbone: self.histogram(d, b),
-                )
-                for prior in pca_priors(self.config, backbone):
-                    found[f"spectrum_{key}_{prior}"] = (
-                        "The PCA prior",
-                        f"{here}: variance explained by the components.",
-                        lambda d=dataset, b=backbone, p=prior: self.spectrum(d, b, p),
-                    )
-                    found[f"modes_{key}_{prior}"] = (
-                        "The PCA prior",
-                        f"{here}: the first modes.",
-                        lambda d=dataset, b=backbone, p=prior: self.modes(d, b, p),
-                    )
-                found[f"training_{key}"] = (
-                    "Training",
-                    f"{here}: training curves.",
-                    lambda d=dataset, b=backbone: self.training(d, b),
-                )
+                of_priors = [
+                    (*kind, name)
+                    for kind in self._kinds_of_priors
+                    for name in pca_priors(self.config, backbone)
+                ]
+                for name, section, text, make, *prior in [*self._kinds, *of_priors]:
+                    caption = f"{_title(dataset, backbone)}: {text}."
+                    drawn = partial(make, dataset, backbone, *prior)
+                    found["_".join([name, dataset, backbone, *prior])] = (section, caption, drawn)
         for name, path in self.searches().items():
             caption = f"Validation errors over λ, {display_name(read_json(path)['backbone'])}."
-            found[name] = ("Choice of λ", caption, lambda p=path: self.search(p))
+            found[name] = ("Choice of λ", caption, partial(self.search, path))
         return {name: found[name] for name in figure_names(self.config)}
+
+
+def _title(dataset: str, backbone: str) -> str:
+    return f"{display_name(dataset)}, {display_name(backbone)}"
 
 
 def draw_figures(results: Path, config: Config, out: Path) -> None:

@@ -11,9 +11,13 @@ import pandas as pd
 
 from dine.config import CONTROL, STAGE1
 from dine.evaluation.statistics import verdicts
-from dine.reporting import tables
-from dine.reporting.tables import CONDITION_NAMES, OBJECTS_NAMES, display_name
+from dine.reporting import names
+from dine.reporting.loading import origin_of
+from dine.reporting.names import DASH, change, display_name, rank
+from dine.reporting.table import Cell, Table
 from dine.results import CLEAN, KNOWN, trained_on
+
+_KEYS = ["objects", "dataset", "backbone", "method"]
 
 
 def effects(
@@ -30,19 +34,13 @@ def effects(
     found = found[found["level"].isna() & ~found["method"].isin([STAGE1, CONTROL])]
     kinds = metrics.groupby("dataset")["objects"].first()
     found = found.assign(objects=found["dataset"].map(kinds))
-    names = {"method": tables.METHOD_NAMES, "backbone": tables.BACKBONE_NAMES, "objects": [KNOWN]}
+    orders = {"method": names.METHODS, "backbone": names.BACKBONES, "objects": [KNOWN]}
     return found.sort_values(
         ["objects", "method", "dataset", "backbone"],
-        key=lambda column: column.map(lambda x: tables.rank(x, names.get(column.name, ()))),
+        key=lambda column: column.map(lambda x: rank(x, orders.get(column.name, ()))),
         kind="stable",
         ignore_index=True,
     )
-
-
-def interval(row: pd.Series) -> str:
-    """A difference in percent of the reference, with its interval."""
-    ends = f" ({row['low']:+.0f} to {row['high']:+.0f})" if pd.notna(row["low"]) else ""
-    return f"{row['relative']:+.0f} %{ends}".replace("-", "−")
 
 
 def headlines(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[str]:
@@ -63,48 +61,65 @@ def _headline(method: str, objects: str, rows: pd.DataFrame, metrics: pd.DataFra
     }
     parts = []
     for verdict, text in words.items():
-        some = rows[rows["verdict"] == verdict]
-        places = [f"{_place(row)} {interval(row)}" for _, row in some.iterrows()]
+        places = [
+            f"{display_name(trained_on(row['dataset']))} with {display_name(row['backbone'])} "
+            f"{change(row['relative'], row['low'], row['high'])}"
+            for row in rows[rows["verdict"] == verdict].to_dict("records")
+        ]
         if places:
             parts.append(f"{text} {', '.join(places)}")
-    made = {tables.ORIGIN_NAMES[tables.origin_of(name, metrics)] for name in rows["dataset"]}
-    kind = f"{OBJECTS_NAMES[objects].capitalize()} ({', '.join(sorted(made))})"
+    made = {names.ORIGINS[origin_of(name, metrics)] for name in rows["dataset"]}
+    kind = f"{names.OBJECTS[objects].capitalize()} ({', '.join(sorted(made))})"
     return f"{kind}: {'; '.join(parts)}."
 
 
-def _place(row: pd.Series) -> str:
-    return f"{display_name(trained_on(row['dataset']))} with {display_name(row['backbone'])}"
-
-
-def overview(metrics: pd.DataFrame, *, spread: float = 0.0) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of a table: each prior's differences under every condition."""
+def overview(metrics: pd.DataFrame, *, spread: float = 0.0) -> Table | None:
+    """Each prior's differences under every condition, with what follows; None without priors."""
     control = effects(metrics, spread=spread)
+    if control.empty:
+        return None
+    errors = effects(metrics, value="mce", spread=spread)
+    first = effects(metrics, STAGE1, spread=spread)
     columns = {
-        f"CD, {CONDITION_NAMES[name].lower()}": control[control["condition"] == name]
-        for name in CONDITION_NAMES
+        f"CD, {text.lower()}": control[control["condition"] == name]
+        for name, text in names.CONDITIONS.items()
         if (control["condition"] == name).any()
     }
-    errors = effects(metrics, value="mce", spread=spread)
     columns["MCE, deformation"] = errors[errors["condition"] == CLEAN]
-    first = effects(metrics, STAGE1, spread=spread)
     columns["CD, deformation, against Stage 1"] = first[first["condition"] == CLEAN]
-    keys = ["objects", "dataset", "backbone", "method"]
-    places = control[keys].drop_duplicates()
-    cells = {
-        name: {tuple(row[keys]): _cell(row) for _, row in table.iterrows()}
-        for name, table in columns.items()
-    }
-    rows = [
-        [
-            OBJECTS_NAMES[place[0]].capitalize(),
-            display_name(trained_on(place[1])),
-            *map(display_name, place[2:]),
-            *(found.get(place, "–") for found in cells.values()),
-        ]
-        for place in places.itertuples(index=False, name=None)
-    ]
-    return ["Objects", "Dataset", "Backbone", "Prior", *columns], rows
+    found = [table.set_index(_KEYS).to_dict("index") for table in columns.values()]
+    rows = []
+    for place in control[_KEYS].drop_duplicates().itertuples(index=False, name=None):
+        head = [names.OBJECTS[place[0]].capitalize(), display_name(trained_on(place[1]))]
+        cells = [verdict_cell(table.get(place)) for table in found]
+        rows.append((*map(Cell, [*head, *map(display_name, place[2:])]), *cells))
+    header = ("Objects", "Dataset", "Backbone", "Prior", *columns)
+    caption = _CAPTION.format(chance=training_chance(spread) if spread else "")
+    return Table("", "", caption, tuple(("", name) for name in header), tuple(rows), control)
 
 
-def _cell(row: pd.Series) -> str:
-    return f"{row['verdict']}: {interval(row)}"
+def verdict_cell(row: dict | None, name: str = "verdict") -> Cell:
+    """A verdict with the difference in percent of the reference and its interval."""
+    if row is None:
+        return Cell(DASH)
+    text = f"{row[name]}: {change(row['relative'], row['low'], row['high'])}"
+    return Cell(text, row[name] == "lower")
+
+
+_CAPTION = (
+    "Differences of the means in percent of the control's (or Stage 1's), over all levels and "
+    "strengths; negative: the prior is lower. In brackets the 95 % interval, of the test pairs "
+    "that both methods share: drawn by deformation where the object is known, and by object where "
+    "it is unseen.{chance} Lower or higher: the interval holds no zero. Otherwise the matter is "
+    "undecided. Known objects are those that were trained on, under deformations that were not; "
+    "the prior is defined for these. Unseen objects were not trained on at all."
+)
+
+
+def training_chance(spread: float) -> str:
+    """What an interval holds besides the chance of the pairs; ``spread`` is a share."""
+    return (
+        " It also holds the chance of the training: another seed, or another CPU's rounding, gives "
+        f"another network, whose difference varies by {100 * spread:g} % of the reference "
+        "(standard deviation; evaluation.training_spread)."
+    )

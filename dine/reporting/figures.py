@@ -22,9 +22,10 @@ from matplotlib.figure import Figure
 from dine.errors import DataError
 from dine.files import atomic_path
 from dine.io import announced
-from dine.reporting import tables
-from dine.reporting.tables import CD_SCALE, display_name
-from dine.results import condition_key
+from dine.reporting import names
+from dine.reporting.names import CD_SCALE, VALUES, display_name, rank
+from dine.reporting.tables import published, summary
+from dine.results import CLEAN, condition_key
 
 if TYPE_CHECKING:
     from dine.data.pairs import PairSet
@@ -36,14 +37,18 @@ _STYLES = {
     "pca": ("#0072B2", "^"),
     "flow": ("#009E73", "D"),
 }
-_OTHER_STYLES = [("#CC79A7", "v"), ("#E69F00", "P"), ("#56B4E9", "X")]
+_OTHER_STYLES = [
+    *(("#CC79A7", "v"), ("#E69F00", "P"), ("#56B4E9", "X"), ("#000000", "<")),
+    *(("#8C6D31", ">"), ("#7B4173", "p"), ("#A6BD2B", "h"), ("#9E9E9E", "d")),
+]
 _ERROR_COLOURS = "coolwarm"
 _UNIT = "×10⁻⁴"
+_SMALL = {"fontsize": 8, "frameon": False}
 
 
 def method_styles(methods: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Colour and marker by method, in the order of the tables."""
-    ordered = sorted(set(methods), key=lambda name: tables.rank(name, tables.METHOD_NAMES))
+    ordered = sorted(set(methods), key=lambda name: rank(name, names.METHODS))
     others = [name for name in ordered if name not in _STYLES]
     return {
         name: _STYLES.get(name) or _OTHER_STYLES[others.index(name) % len(_OTHER_STYLES)]
@@ -70,8 +75,9 @@ def save_figure(figure: Figure, path_stem: str | os.PathLike) -> list[Path]:
 
 
 def new_figure(width: float, height: float, title: str, origin: str, note: str = "") -> Figure:
+    """An empty figure, inches; its title says where the data come from."""
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure.suptitle(f"{title} ({tables.ORIGIN_NAMES[origin]})", fontsize=12)
+    figure.suptitle(f"{plain(title)} ({names.ORIGINS[origin]})", fontsize=12)
     if note:
         figure.supxlabel(note, fontsize=8, color="#444444")
     return figure
@@ -84,72 +90,67 @@ def plain_axes(axes: Any) -> Any:
     return axes
 
 
+def plain(text: str) -> str:
+    """Text that a figure shows as it is: dollars would begin a formula."""
+    return text.replace("$", r"\$")
+
+
 # --------------------------------------------------------------------------- distances
 
 
-def distance_figure(dataset: str, metrics: pd.DataFrame, condition: str = "deformation") -> Figure:
+def distance_figure(dataset: str, metrics: pd.DataFrame, condition: str = CLEAN) -> Figure:
     """Mean Chamfer distance over level or corruption strength; one panel per backbone.
 
     Bands show one sample standard deviation; hollow dashed markers are the published means.
     """
-    clean = condition == "deformation"
+    clean = condition == CLEAN
     rows = metrics[(metrics["dataset"] == dataset) & (metrics["condition"] == condition)]
     key = "level" if clean else "corruption"
-    ours = tables.summary(rows, pool_levels=not clean).dropna(subset=key)
+    ours = summary(rows, pool_levels=not clean).dropna(subset=key)
     if ours.empty:
         raise DataError(f"The metrics hold no {condition} rows of {dataset} with a {key} to plot.")
-    paper = tables.published()
+    paper = published()
     paper = paper[(paper["dataset"] == dataset) & (paper["condition"] == condition)]
-    backbones = sorted(
-        ours["backbone"].unique(), key=lambda name: tables.rank(name, tables.BACKBONE_NAMES)
-    )
+    backbones = sorted(ours["backbone"].unique(), key=lambda name: rank(name, names.BACKBONES))
     styles = method_styles(ours["method"])
-    origin = str(rows["origin"].iloc[0])
     note = "Bands: ± one standard deviation over test pairs."
     if len(paper):
         note += f" Hollow, dashed: published means on the real {display_name(dataset)} data."
-    names = {"deformation": "increasing deformation", "outliers": "outliers", "noise": "noise"}
-    figure = new_figure(
-        5.2 * len(backbones) + 0.4,
-        4.3,
-        f"{display_name(dataset)}: {names[condition]}",
-        origin,
-        note,
-    )
+    title, label = {
+        "deformation": ("increasing deformation", "Deformation level"),
+        "outliers": ("outliers", "Outliers (%)"),
+        "noise": ("noise", "Noise σ"),
+    }[condition]
+    title = f"{display_name(dataset)}: {title}"
+    width = 5.2 * len(backbones) + 0.4
+    figure = new_figure(width, 4.3, title, str(rows["origin"].iloc[0]), note)
     panels = figure.subplots(1, len(backbones), sharey=True, squeeze=False)[0]
     for axes, backbone in zip(panels, backbones, strict=True):
-        for method, (colour, marker) in styles.items():
-            line = ours[(ours["backbone"] == backbone) & (ours["method"] == method)]
-            line = line.sort_values(key)
-            if len(line):
-                x, mean, std = (line[name].to_numpy(float) for name in (key, "mean", "std"))
-                axes.plot(x, mean, color=colour, marker=marker, ms=5, label=display_name(method))
-                low = np.maximum(mean - std, 0)
-                axes.fill_between(x, low, mean + std, color=colour, alpha=0.13, linewidth=0)
-            line = paper[(paper["backbone"] == backbone) & (paper["method"] == method)]
-            line = line.sort_values(key)
-            if len(line):
-                axes.plot(
-                    line[key],
-                    line["published_mean"],
-                    color=colour,
-                    marker=marker,
-                    ms=5,
-                    markerfacecolor="white",
-                    linestyle="--",
-                    linewidth=1,
-                    label=f"{display_name(method)}, paper",
-                )
+        for method, style in styles.items():
+            here = [x[(x["backbone"] == backbone) & (x["method"] == method)] for x in (ours, paper)]
+            _distance_lines(axes, *(x.sort_values(key) for x in here), key, style)
         axes.set_title(display_name(backbone), fontsize=11)
-        axes.set_xlabel(
-            {"deformation": "Deformation level", "outliers": "Outliers (%)", "noise": "Noise σ"}[
-                condition
-            ]
-        )
+        axes.set_xlabel(label)
         axes.set_ylim(bottom=0)
-        plain_axes(axes).legend(fontsize=8, frameon=False)
+        plain_axes(axes).legend(**_SMALL)
     panels[0].set_ylabel(f"Chamfer distance {_UNIT}")
     return figure
+
+
+def _distance_lines(
+    axes: Any, ours: pd.DataFrame, paper: pd.DataFrame, key: str, style: tuple[str, str]
+) -> None:
+    """One method's means over ``key`` with their band, and the published ones."""
+    line = {"color": style[0], "marker": style[1], "ms": 5}
+    if len(ours):
+        x, mean, std = (ours[name].to_numpy(float) for name in (key, "mean", "std"))
+        axes.plot(x, mean, **line, label=display_name(ours["method"].iloc[0]))
+        low = np.maximum(mean - std, 0)
+        axes.fill_between(x, low, mean + std, color=style[0], alpha=0.13, linewidth=0)
+    if len(paper):
+        label = f"{display_name(paper['method'].iloc[0])}, paper"
+        hollow = {"markerfacecolor": "white", "linestyle": "--", "linewidth": 1}
+        axes.plot(paper[key], paper["published_mean"], **line, **hollow, label=label)
 
 
 # --------------------------------------------------------------------------- point errors
@@ -175,31 +176,21 @@ def read_group(path: str | os.PathLike, condition: str, field: str) -> tuple[np.
         raise DataError(f"{path} is not a readable HDF5 file ({error}).") from error
 
 
-def tail_shares(
-    errors: Mapping[str, np.ndarray], threshold: float | None = None
-) -> tuple[float, dict[str, float]]:
-    """Share of points, by method, with a squared distance above ``threshold``.
+def histogram_figure(errors: Mapping[str, np.ndarray], title: str, origin: str) -> Figure:
+    """Per-point squared distances to the target by method, as the paper's Figure 4 (log count).
 
-    Without a threshold it is the 99th percentile of Stage 1 (of the first method where Stage 1 is
+    The tail is what lies above the 99th percentile of Stage 1 (of the first method where Stage 1 is
     absent), whose own share is then 1 % and the yardstick for the others.
     """
-    if threshold is None:
-        reference = errors["stage1"] if "stage1" in errors else next(iter(errors.values()))
-        threshold = float(np.percentile(reference, 99))
-    return threshold, {name: float(np.mean(e > threshold)) for name, e in errors.items()}
-
-
-def histogram_figure(
-    errors: Mapping[str, np.ndarray], title: str, origin: str, threshold: float | None = None
-) -> Figure:
-    """Per-point squared distances to the target by method, as the paper's Figure 4 (log count)."""
-    threshold, shares = tail_shares(errors, threshold)
+    reference = errors["stage1"] if "stage1" in errors else next(iter(errors.values()))
+    threshold = float(np.percentile(reference, 99))
     # A few stray points must not squeeze the rest: the last bin takes everything beyond.
     top = max(float(np.percentile(e, 99.99, method="lower")) for e in errors.values())
     edge = CD_SCALE * max(top, threshold, np.finfo(np.float32).tiny)
     figure = new_figure(6.6, 4.4, title, origin, "The last bin also holds all larger distances.")
     axes = plain_axes(figure.subplots())
     for method, (colour, _) in method_styles(errors).items():
+        share = 100 * np.mean(errors[method] > threshold)
         axes.hist(
             np.minimum(CD_SCALE * np.ravel(errors[method]), edge),
             bins=np.linspace(0, edge, 81),
@@ -207,18 +198,13 @@ def histogram_figure(
             linewidth=1.5,
             color=colour,
             log=True,
-            label=f"{display_name(method)}: {100 * shares[method]:.2f} % above",
+            label=f"{display_name(method)}: {share:.2f} % above",
         )
     axes.axvline(CD_SCALE * threshold, color="black", linestyle=":", linewidth=1)
     axes.set_xlabel(f"Squared distance of a registered point to the clean target {_UNIT}")
     axes.set_ylabel("Points")
-    axes.legend(
-        title=f"Tail above {CD_SCALE * threshold:.4g} {_UNIT} (dotted)",
-        fontsize=9,
-        title_fontsize=9,
-        frameon=False,
-        alignment="left",
-    )
+    title = f"Tail above {CD_SCALE * threshold:.4g} {_UNIT} (dotted)"
+    axes.legend(title=title, fontsize=9, title_fontsize=9, frameon=False, alignment="left")
     return figure
 
 
@@ -246,21 +232,16 @@ class Example:
     seen: np.ndarray | None = None
 
 
-def pick_examples(
-    dataset: str, backbone: str, metrics: pd.DataFrame, method: str = "stage1"
-) -> list[tuple[str, str, str]]:
+def pick_examples(dataset: str, backbone: str, metrics: pd.DataFrame) -> list[tuple[str, str, str]]:
     """``(condition key, pair, label)`` of a typical hard case of every condition.
 
     From the strongest corruption of each condition, and there the largest deformation level, the
-    pair with the median error of ``method``: a rule, so that no case is chosen by its looks.
+    pair with the median error of Stage 1: a rule, so that no case is chosen by its looks.
     """
-    rows = metrics[
-        (metrics["dataset"] == dataset)
-        & (metrics["backbone"] == backbone)
-        & (metrics["method"] == method)
-    ]
+    of_place = (metrics["dataset"] == dataset) & (metrics["backbone"] == backbone)
+    rows = metrics[of_place & (metrics["method"] == "stage1")]
     picks = []
-    for condition in ("deformation", "noise", "outliers"):
+    for condition in (CLEAN, "noise", "outliers"):
         part = rows[rows["condition"] == condition]
         if part.empty:
             continue
@@ -269,7 +250,7 @@ def pick_examples(
             part = part[part["level"] == part["level"].max()]
         part = part.sort_values(["cd", "pair"], ignore_index=True)
         row = part.iloc[(len(part) - 1) // 2]
-        label = tables.setting_text(condition, row["corruption"])
+        label = names.setting_name(condition, row["corruption"])
         if not np.isnan(row["level"]):
             label += f"\nlevel {row['level']:g}"
         picks.append((condition_key(condition, row["corruption"]), str(row["pair"]), label))
@@ -286,10 +267,10 @@ def load_examples(
 
     Errors are squared distances to the clean target, in the unit of the tables.
     """
-    names = np.asarray(pairs.name).astype(str)
+    listed = np.asarray(pairs.name).astype(str)
     examples = []
     for key, pair, label in picks:
-        index = _find(names, pair, "the pairs")
+        index = _find(listed, pair, "the pairs")
         source = np.asarray(pairs.source[index])
         registered, errors = {}, {}
         for method, path in predictions.items():
@@ -301,8 +282,8 @@ def load_examples(
     return examples
 
 
-def _find(names: np.ndarray, pair: str, where: Any) -> int:
-    found = np.flatnonzero(names == pair)
+def _find(listed: np.ndarray, pair: str, where: Any) -> int:
+    found = np.flatnonzero(listed == pair)
     if not len(found):
         raise DataError(f"Pair {pair} is not in {where}; evaluate the same pairs again.")
     return int(found[0])
@@ -332,56 +313,47 @@ def qualitative_figure(
     """
     known = examples[0].registered
     titles = titles or {name: display_name(name) for name in method_styles(known)}
-    methods = [name for name in titles if name in known]
+    titles = {name: plain(text) for name, text in titles.items() if name in known}
     shown = np.concatenate([e for example in examples for e in example.errors.values()])
     norm = Normalize(0, float(np.percentile(shown, 98)))
-    columns = 1 + len(methods)
-    figure = new_figure(
-        2.6 * columns + 1,
-        2.1 * len(examples) + 0.9,
-        title,
-        origin,
-        note,
-    )
-    panels = figure.subplots(len(examples), columns, squeeze=False, subplot_kw={"projection": "3d"})
-    for row, (example, line) in enumerate(zip(examples, panels, strict=True)):
-        centre, rotation = _principal_frame(example.source)
-        view = [(cloud - centre) @ rotation for cloud in (example.source, example.target)]
-        limits = _cube(np.concatenate(view))
-        for axes in line:
-            _bare_axes(axes, limits)
-        before = example.target if example.seen is None else example.seen
-        line[0].scatter(*view[0].T, s=4, color="#E69F00", linewidth=0, label="source")
-        line[0].scatter(
-            *((before - centre) @ rotation).T, s=4, color="#999999", linewidth=0, label="target"
-        )
-        line[0].text2D(
-            -0.02, 0.5, example.label, rotation=90, va="center", ha="right",
-            transform=line[0].transAxes, multialignment="center",
-        )  # fmt: skip
-        for axes, method in zip(line[1:], methods, strict=True):
-            axes.scatter(*view[1].T, s=2, color="#BBBBBB", linewidth=0, alpha=0.5)
-            axes.scatter(
-                *((example.registered[method] - centre) @ rotation).T,
-                s=6,
-                c=example.errors[method],
-                cmap=_ERROR_COLOURS,
-                norm=norm,
-                linewidth=0,
-                depthshade=False,
-            )
-        if row == 0:
-            line[0].legend(fontsize=8, frameon=False, loc="upper left", markerscale=2)
-            for axes, name in zip(line, ["Before", *map(titles.get, methods)], strict=True):
-                axes.set_title(name, fontsize=11)
-    figure.colorbar(
-        ScalarMappable(norm, _ERROR_COLOURS),
-        ax=panels,
-        shrink=0.6,
-        extend="max",
-        label=error,
-    )
+    size = (2.6 * (1 + len(titles)) + 1, 2.1 * len(examples) + 0.9)
+    figure = new_figure(*size, title, origin, note)
+    panels = _views(figure, len(examples), 1 + len(titles))
+    for example, line in zip(examples, panels, strict=True):
+        _example_row(line, example, list(titles), norm)
+    panels[0, 0].legend(**_SMALL, loc="upper left", markerscale=2)
+    for axes, text in zip(panels[0], ["Before", *titles.values()], strict=True):
+        axes.set_title(text, fontsize=11)
+    scale = ScalarMappable(norm, _ERROR_COLOURS)
+    figure.colorbar(scale, ax=panels, shrink=0.6, extend="max", label=error)
     return figure
+
+
+def _example_row(
+    line: Sequence[Any], example: Example, methods: Sequence[str], norm: Normalize
+) -> None:
+    centre, rotation = _principal_frame(example.source)
+    source, target = ((x - centre) @ rotation for x in (example.source, example.target))
+    limits = _cube(np.concatenate([source, target]))
+    for axes in line:
+        _bare_axes(axes, limits)
+    seen = target if example.seen is None else (example.seen - centre) @ rotation
+    line[0].scatter(*source.T, s=4, color="#E69F00", linewidth=0, label="source")
+    line[0].scatter(*seen.T, s=4, color="#999999", linewidth=0, label="target")
+    line[0].text2D(
+        -0.02, 0.5, example.label, rotation=90, va="center", ha="right",
+        transform=line[0].transAxes, multialignment="center",
+    )  # fmt: skip
+    for axes, method in zip(line[1:], methods, strict=True):
+        axes.scatter(*target.T, s=2, color="#BBBBBB", linewidth=0, alpha=0.5)
+        cloud = (example.registered[method] - centre) @ rotation
+        colours = {"c": example.errors[method], "cmap": _ERROR_COLOURS, "norm": norm}
+        axes.scatter(*cloud.T, s=6, **colours, linewidth=0, depthshade=False)
+
+
+def _views(figure: Figure, down: int, across: int) -> np.ndarray:
+    """Panels (down, across) to look at clouds in."""
+    return figure.subplots(down, across, squeeze=False, subplot_kw={"projection": "3d"})
 
 
 def _principal_frame(cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -413,38 +385,66 @@ def _bare_axes(axes: Any, limits: list[tuple[float, float]]) -> None:
 # ------------------------------------------------------------------------------- training
 
 
-def lambda_figure(search: Mapping[str, Any], origin: str) -> Figure:
-    """Validation errors over the prior weight, with the choice and the λ = 0 control marked."""
-    curve = pd.DataFrame(search["curve"]).astype({"lambda": float, "cd": float, "mce": float})
-    labels = {
-        "cd": (CD_SCALE, f"Mean Chamfer distance {_UNIT}"),
-        "mce": (1.0, "Mean correspondence error"),
-    }
-    columns = [name for name in labels if curve[name].notna().any()]
-    title = f"Choice of λ: {display_name(search['dataset'])}, {display_name(search['backbone'])}"
-    note = "Validation pairs. Star: chosen λ. Dashed: λ = 0, longer training alone."
-    figure = new_figure(4.8 * len(columns), 4.2, title, origin, note)
-    panels = figure.subplots(1, len(columns), squeeze=False)[0]
-    for axes, column in zip(panels, columns, strict=True):
-        scale, label = labels[column]
-        for prior, (colour, marker) in method_styles(curve["prior"]).items():
-            line = curve[curve["prior"] == prior].sort_values("lambda").dropna(subset=column)
-            for value in line.loc[line["lambda"] == 0, column]:
-                axes.axhline(scale * value, color=colour, linestyle="--", linewidth=1)
-            line = line[line["lambda"] > 0]
-            x, y = line["lambda"].to_numpy(), scale * line[column].to_numpy()
-            axes.plot(x, y, color=colour, marker=marker, label=display_name(prior))
-            chosen = np.isclose(x, search["selected"].get(prior, np.nan), rtol=1e-6, atol=0)
-            axes.plot(
-                x[chosen], y[chosen], color=colour, marker="*", ms=17, markeredgecolor="black",
-                linestyle="none", zorder=3,
-            )  # fmt: skip
-        axes.set_xscale("log")
-        axes.set_xlabel("Prior weight λ")
-        axes.set_ylabel(label)
+def search_figure(
+    searches: Sequence[Mapping[str, Any]], where: str, origin: str, titles: Mapping[str, str] = {}
+) -> Figure:
+    """Validation errors over the prior weight, with the choice and the λ = 0 control marked.
+
+    Where the search has them, the error against the roughness of the fields as well.
+
+    Args:
+        searches: results of ``dine search-lambda`` with one dataset and backbone.
+        where: these, for the title.
+        origin: of the data.
+        titles: of priors; others have the name of the tables.
+    """
+    curve = pd.DataFrame([row for search in searches for row in search["curve"]])
+    for name in ("lambda", "cd", "mce", "roughness"):
+        curve[name] = curve[name].astype(float) if name in curve else np.nan
+    chosen = {k: v for search in searches for k, v in search.get("selected", {}).items()}
+    curve["chosen"] = np.isclose(
+        curve["lambda"], curve["prior"].map(chosen).astype(float), rtol=1e-6, atol=0
+    )
+    panels = [("lambda", value) for value in VALUES if curve[value].notna().any()]
+    if curve["roughness"].notna().any() and curve["mce"].notna().any():
+        panels.append(("roughness", "mce"))
+    criteria = {str(search.get("criterion", "cd")).upper() for search in searches}
+    note = f"Validation pairs. Star: chosen λ (lowest {names.join(sorted(criteria))}). "
+    note += "Dashed: λ = 0, longer training alone."
+    figure = new_figure(4.3 * len(panels) + 0.8, 4.2, f"Choice of λ: {where}", origin, note)
+    drawn = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (x, value) in zip(drawn, panels, strict=True):
+        _search_lines(axes, curve.dropna(subset=[x, value]), x, value, titles)
+        axes.set_xlabel("Prior weight λ" if x == "lambda" else "Roughness of the field")
+        axes.set_ylabel(VALUES[value][0])
         plain_axes(axes)
-    panels[0].legend()
+    drawn[0].legend(**_SMALL)
     return figure
+
+
+def _search_lines(
+    axes: Any, curve: pd.DataFrame, x: str, value: str, titles: Mapping[str, str]
+) -> None:
+    scale = VALUES[value][2]
+    control = curve[curve["lambda"] == 0].drop_duplicates([x, value])
+    if x == "lambda":
+        # Every prior has the same control.
+        for height in control[value].unique():
+            axes.axhline(scale * height, color="#555555", linestyle="--", linewidth=1)
+        axes.set_xscale("log")
+        curve = curve[curve["lambda"] > 0]
+    else:
+        axes.plot(control[x], scale * control[value], "s", color="#555555", zorder=4, label="λ = 0")
+        axes.legend(**_SMALL)
+    for prior, (colour, marker) in method_styles(curve["prior"]).items():
+        line = curve[curve["prior"] == prior].sort_values("lambda")
+        label = plain(titles.get(prior) or display_name(prior)) if x == "lambda" else None
+        axes.plot(
+            line[x], scale * line[value], color=colour, marker=marker, ms=5, lw=1.2, label=label
+        )
+        star = line[line["chosen"]]
+        dot = {"color": colour, "ms": 15, "markeredgecolor": "black", "zorder": 3}
+        axes.plot(star[x], scale * star[value], "*", **dot)
 
 
 def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: str) -> Figure:
@@ -458,10 +458,10 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
         "val_mce": "Validation correspondence error",
         "val_roughness": "Validation roughness",
     }
-    names = list(dict.fromkeys(name for frame in histories.values() for name in frame))
+    found = dict.fromkeys(name for frame in histories.values() for name in frame)
     columns = [
         name
-        for name in [*known, *(name for name in names if name.startswith("val"))]
+        for name in [*known, *(name for name in found if name.startswith("val"))]
         if any(name in frame and frame[name].notna().any() for frame in histories.values())
     ]
     if not columns:
@@ -487,7 +487,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
         plain_axes(axes)
     for axes in panels[len(columns) :]:
         axes.set_visible(False)
-    panels[0].legend(fontsize=8, frameon=False)
+    panels[0].legend(**_SMALL)
     return figure
 
 
@@ -527,14 +527,14 @@ def pca_modes_figure(
     source: np.ndarray,
     title: str,
     origin: str,
-    count: int = 3,
 ) -> Figure:
     """The first modes on the source, at −2 and +2 standard deviations around the mean field.
 
     ``modes`` (n_c, N, 3) are displacements per unit of a coefficient whose variance is
-    ``explained_variance``. Colour and arrows show the mode's own share of the displacement.
+    ``explained_variance``; ``mean`` and ``source`` are (N, 3). Colour and arrows show the mode's
+    own share of the displacement.
     """
-    count = min(count, len(modes))
+    count = min(3, len(modes))
     steps = 2 * np.sqrt(explained_variance[:count])[:, None, None] * modes[:count]
     lengths = np.linalg.norm(steps, axis=2)
     norm = Normalize(0, float(lengths.max()) or 1.0)
@@ -544,30 +544,26 @@ def pca_modes_figure(
         np.concatenate([(base + sign * s @ rotation) for s in steps for sign in (-1, 1)])
     )
     arrows = np.linspace(0, len(source) - 1, min(len(source), 150)).astype(int)
-    figure = new_figure(
-        3.1 * count + 1,
-        5.6,
-        title,
-        origin,
-        "Points: mean field ± 2 standard deviations of one mode. Arrows: from the mean field.",
-    )
-    panels = figure.subplots(2, count, squeeze=False, subplot_kw={"projection": "3d"})
+    note = "Points: mean field ± 2 standard deviations of one mode. Arrows: from the mean field."
+    figure = new_figure(3.1 * count + 1, 5.6, title, origin, note)
+    panels = _views(figure, 2, count)
     for line, sign in zip(panels, (-1, 1), strict=True):
         for mode, axes in enumerate(line):
             step = sign * steps[mode] @ rotation
             _bare_axes(axes, limits)
-            axes.scatter(
-                *(base + step).T, s=5, c=lengths[mode], cmap="viridis", norm=norm, linewidth=0
-            )
+            _coloured(axes, base + step, lengths[mode], norm)
             axes.quiver(
                 *base[arrows].T, *step[arrows].T, color="#333333", linewidth=0.5, alpha=0.7,
                 arrow_length_ratio=0.3,
             )  # fmt: skip
             axes.set_title(f"Mode {mode + 1}, {'+' if sign > 0 else '−'}2 sd", fontsize=10)
-    figure.colorbar(
-        ScalarMappable(norm, "viridis"), ax=panels, shrink=0.6, label="Displacement by the mode"
-    )
+    scale = ScalarMappable(norm, "viridis")
+    figure.colorbar(scale, ax=panels, shrink=0.6, label="Displacement by the mode")
     return figure
+
+
+def _coloured(axes: Any, cloud: np.ndarray, values: np.ndarray, norm: Normalize) -> None:
+    axes.scatter(*cloud.T, s=5, c=values, cmap="viridis", norm=norm, linewidth=0)
 
 
 def prior_samples_figure(
@@ -582,16 +578,12 @@ def prior_samples_figure(
     limits = _cube(np.concatenate([base * 1.3, base]))
     count = len(samples)
     figure = new_figure(3.1 * (count + 1) + 0.8, 3.4, title, origin, "Left: the source as it is.")
-    panels = figure.subplots(1, count + 1, subplot_kw={"projection": "3d"})
+    panels = _views(figure, 1, count + 1)
     fields = [np.zeros_like(source), *samples]
-    for number, (axes, field) in enumerate(zip(panels, fields, strict=True)):
+    for number, (axes, field) in enumerate(zip(panels[0], fields, strict=True)):
         _bare_axes(axes, limits)
-        colour = np.linalg.norm(field, axis=1)
-        axes.scatter(
-            *(base + field @ rotation).T, s=5, c=colour, cmap="viridis", norm=norm, linewidth=0
-        )
+        _coloured(axes, base + field @ rotation, np.linalg.norm(field, axis=1), norm)
         axes.set_title("Source" if number == 0 else f"Sample {number}", fontsize=10)
-    figure.colorbar(
-        ScalarMappable(norm, "viridis"), ax=list(panels), shrink=0.7, label="Displacement"
-    )
+    scale = ScalarMappable(norm, "viridis")
+    figure.colorbar(scale, ax=panels, shrink=0.7, label="Displacement")
     return figure

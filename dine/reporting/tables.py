@@ -1,216 +1,105 @@
-"""Tables of a run beside the published ones, as tidy CSV, Markdown and LaTeX.
+"""Tables of a run beside the published ones.
 
 Means are over test pairs; ± is the sample standard deviation over them (ddof = 1). The paper does
 not say which of the two it uses; from ten pairs on they differ by less than 6 %. Chamfer distances
 are squared, symmetric, in the normalised frame, and shown in units of 1e-4 as in the paper.
-
-A dataset whose test pairs are both of objects that were trained on and of others is shown as two:
-under its own name the known objects, and with ``_unseen`` behind it the others.
 """
 
 from __future__ import annotations
 
-import functools
-import os
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from dine.errors import DataError
 from dine.evaluation.statistics import verdicts
-from dine.files import atomic_path, write_text
-from dine.results import CLEAN, KNOWN, PAPER_TABLES, UNSEEN, table_name, trained_on, unseen_of
+from dine.reporting import names
+from dine.reporting.loading import origin_of, rounded
+from dine.reporting.names import CD_SCALE, DASH, display_name, mean_and_deviation, rank
+from dine.reporting.table import Cell, Columns, Table, laid_out
+from dine.results import CLEAN, PAPER_TABLES, table_name, trained_on
 
-CD_SCALE = 1e4
-COLUMNS = [
-    *("dataset", "backbone", "method", "seed", "origin", "pair", "object", "objects", "cluster"),
-    *("level", "condition", "corruption", "cd", "cd_observed", "cd_unregistered", "mce"),
-]
-DATASET_NAMES = {"deformedtissue": "DeformedTissue", "synbench": "SynBench"}
-BACKBONE_NAMES = {
-    "robust_defreg": "Robust-DefReg",
-    "deftransnet": "DefTransNet",
-    "robust_defreg_geometric": "Robust-DefReg, geometric start",
-}
-METHOD_NAMES = {
-    "stage1": "Stage 1",
-    "lambda0": "Control (λ = 0)",
-    "pca": "DINE-PCA",
-    "pca_residual": "PCA with residual",
-    "flow": "DINE-Flow",
-    "unregistered": "Unregistered",
-}
-ORIGIN_NAMES = {
-    "synthetic": "synthetic data",
-    "bases": "real base meshes with synthetic deformations",
-    "path": "data supplied by the user",
-    "doi": "published data",
-}
-# The paper's order: its Table 3 lists outliers before noise.
-CONDITION_NAMES = {
-    "deformation": "Deformation",
-    "outliers": "Outliers",
-    "noise": "Noise",
-    "resampled": "Other points",
-}
 CORRUPTIONS = ("outliers", "noise", "resampled")
-OBJECTS_NAMES = {KNOWN: "known objects", UNSEEN: "unseen objects"}
 BASELINES = ("stage1", "lambda0")
 
-_PAPER_TABLES = {
-    number: (dataset, CORRUPTIONS if corrupted else ("deformation",))
-    for (dataset, corrupted), number in PAPER_TABLES.items()
-}
+_SETTING = ["condition", "corruption", "level"]
+_SERIES = ["backbone", "method"]
+_MEAN = "mean ± sample standard deviation over test pairs"
 _BOLD = (
     "Bold: lower than the control of the same backbone, and the 95 % interval of the difference "
     "holds no zero."
 )
-_SETTING = ["condition", "corruption", "level"]
-_SERIES = ["backbone", "method"]
-_TEXT_COLUMNS = ("dataset", *_SERIES, "origin", "pair", "object", "objects", "cluster")
-_DASH = "–"
-# Levels and corruptions that passed through float32 must still meet; real ones lie far apart.
-_KEY_DECIMALS = 6
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One entry of a displayed table, as plain text."""
+class Kind:
+    """What a table of means is of: its title, what its caption says of it, and which numbers."""
 
-    text: str
-    bold: bool = False
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table to read (``header``, ``rows``) and the tidy numbers behind it (``data``).
-
-    ``header`` holds (group, label) per column; adjacent columns of one group share a heading, and
-    the group of a row-label column is empty.
-    """
-
-    name: str
     title: str
     caption: str
-    header: tuple[tuple[str, str], ...]
-    rows: tuple[tuple[Cell, ...], ...]
-    data: pd.DataFrame
+    conditions: tuple[str, ...]
+    value: str = "cd"
+    scale: float = CD_SCALE
+    decimals: int = 2
+    in_paper: bool = False
 
 
-# ---------------------------------------------------------------------------------- input
+KINDS = {
+    "deformation": Kind(
+        "Increasing deformation",
+        f"Chamfer distance in units of 10⁻⁴ to the target: {_MEAN}; lower is better. {_BOLD}",
+        (CLEAN,),
+        in_paper=True,
+    ),
+    "corruption": Kind(
+        "Outliers and noise",
+        "Chamfer distance in units of 10⁻⁴ to the clean target under outliers (% of the points) "
+        f"and Gaussian noise (σ), pooled over deformation levels: {_MEAN}; lower is better. "
+        f"{_BOLD}",
+        CORRUPTIONS,
+        in_paper=True,
+    ),
+    "correspondence": Kind(
+        "Correspondence error",
+        "Mean distance between a registered point and its true counterpart, in the normalised "
+        f"frame, {_MEAN}; lower is better. Unlike the Chamfer distance it sees points that slid "
+        f"along the surface. {_BOLD}",
+        tuple(names.CONDITIONS),
+        value="mce",
+        scale=1.0,
+        decimals=4,
+    ),
+    "observed": Kind(
+        "Against the observed target",
+        "Chamfer distance to the observed target, with its outliers and noise, in units of 10⁻⁴, "
+        f"{_MEAN}. A method that follows the corruption scores well here and badly against the "
+        f"clean target. {_BOLD}",
+        CORRUPTIONS,
+        value="cd_observed",
+    ),
+}
+"""Tables of means, by the beginning of their names."""
 
 
-def load_metrics(paths: Iterable[str | os.PathLike]) -> pd.DataFrame:
-    """Read per-pair metrics files into one frame.
-
-    ``mce`` may be empty (pairs without known correspondences) and so may ``level``; every Chamfer
-    distance must be a finite number of at least 0.
-
-    Raises:
-        DataError: a file is missing, lacks a column or holds values that cannot be used, or the
-            files contradict each other.
-    """
-    frames = [_load_one(Path(path)) for path in paths]
-    metrics = combined(frames, ["dataset", *_SERIES, "seed", "condition", "corruption", "pair"])
-    kinds = metrics.groupby("dataset")["objects"].transform("nunique")
-    apart = (kinds > 1) & (metrics["objects"] == UNSEEN)
-    return metrics.assign(dataset=metrics["dataset"].mask(apart, metrics["dataset"].map(unseen_of)))
+# -------------------------------------------------------------------------------- numbers
 
 
-def combined(frames: Sequence[pd.DataFrame], key: list[str]) -> pd.DataFrame:
-    """The rows of all frames; columns ``key`` tell evaluations apart.
-
-    Raises:
-        DataError: no frames, the same evaluation in two rows, or a dataset of mixed origins.
-    """
-    if not frames:
-        raise DataError("No metrics files were given; evaluate a model first.")
-    metrics = pd.concat(frames, ignore_index=True)
-    repeated = metrics[metrics.duplicated(key)]
-    if len(repeated):
-        what = ", ".join(f"{name} {value}" for name, value in repeated.iloc[0][key].items())
-        raise DataError(f"The metrics files hold the same evaluation twice ({what}).")
-    for dataset, origins in metrics.groupby("dataset")["origin"].unique().items():
-        if len(origins) > 1:
-            raise DataError(
-                f"The metrics files of {dataset} mix data of different origins "
-                f"({', '.join(sorted(origins))}); their numbers cannot stand in one table."
-            )
-    return metrics
-
-
-def _load_one(path: Path) -> pd.DataFrame:
-    try:
-        frame = pd.read_csv(path, dtype=dict.fromkeys(_TEXT_COLUMNS, str))
-    except FileNotFoundError as error:
-        raise DataError(f"{path} does not exist.") from error
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} is not a readable CSV file ({error}).") from error
-    missing = [name for name in COLUMNS if name not in frame]
-    if missing:
-        raise DataError(f"{path} lacks the column(s) {', '.join(missing)}.")
-    if frame.empty:
-        raise DataError(f"{path} holds no rows.")
-    for name in _TEXT_COLUMNS:
-        if frame[name].isna().any():
-            raise DataError(f"{path}: column {name} is empty in some rows.")
-    for name in ("seed", "level", "corruption", "cd", "cd_observed", "cd_unregistered", "mce"):
-        try:
-            frame[name] = pd.to_numeric(frame[name]).astype(float)
-        except (TypeError, ValueError) as error:
-            raise DataError(f"{path}: column {name} is not numeric ({error}).") from error
-        if name in ("level", "mce"):
-            continue
-        bad = ~(np.isfinite(frame[name]) & (frame[name] >= 0))
-        if bad.any():
-            raise DataError(
-                f"{path}: column {name} holds {frame.loc[bad, name].iloc[0]} in data row "
-                f"{int(np.argmax(bad)) + 1}; it must be a finite number of at least 0."
-            )
-    for name, allowed in (
-        ("condition", CONDITION_NAMES),
-        ("origin", ORIGIN_NAMES),
-        ("objects", OBJECTS_NAMES),
-    ):
-        unknown = frame.loc[~frame[name].isin(list(allowed)), name]
-        if len(unknown):
-            raise DataError(
-                f"{path}: unknown {name} {unknown.iloc[0]!r}; expected one of {', '.join(allowed)}."
-            )
-    return frame[COLUMNS]
-
-
-@functools.cache
-def _published() -> pd.DataFrame:
+def published() -> pd.DataFrame:
+    """The paper's Tables 1 to 3, keyed like the metrics: corruption 0 and a level for deformation,
+    no level and sigma or percent as corruption for noise and outliers."""
     source = resources.files("dine.reporting").joinpath("published_results.csv")
     with source.open(encoding="utf-8") as stream:
         frame = pd.read_csv(stream)
     frame = frame.rename(columns={"cd_mean_1e-4": "published_mean", "cd_std_1e-4": "published_std"})
     # The paper's "level" of a corruption is its strength: sigma, or outliers as a fraction.
     strength = frame["level"].where(frame["condition"] != "outliers", frame["level"] * 100)
-    deformation = frame["condition"] == "deformation"
+    deformation = frame["condition"] == CLEAN
     frame["corruption"] = strength.mask(deformation, 0.0)
     frame["level"] = frame["level"].where(deformation)
-    return _rounded(frame)
-
-
-def published() -> pd.DataFrame:
-    """The paper's Tables 1 to 3, keyed like the metrics: corruption 0 and a level for deformation,
-    no level and sigma or percent as corruption for noise and outliers."""
-    return _published().copy()
-
-
-def _rounded(frame: pd.DataFrame) -> pd.DataFrame:
-    keys = {name: frame[name].astype(float).round(_KEY_DECIMALS) for name in _SETTING[1:]}
-    return frame.assign(**keys)
-
-
-# -------------------------------------------------------------------------------- numbers
+    return rounded(frame)
 
 
 def summary(
@@ -222,7 +111,7 @@ def summary(
     of pairs. The standard deviation of a single pair is missing, not zero. With ``pool_levels``
     all deformation levels count together and ``level`` is missing.
     """
-    frame = _rounded(metrics)
+    frame = rounded(metrics)
     frame[value] = scale * frame[value]
     if pool_levels:
         frame["level"] = np.nan
@@ -230,71 +119,56 @@ def summary(
     return grouped.agg(n="count", mean="mean", std="std").reset_index()
 
 
-def _unregistered(metrics: pd.DataFrame) -> pd.DataFrame:
-    """The source as it is, as a method of no backbone: every method shares the same pairs."""
-    frame = metrics.drop_duplicates(["dataset", "condition", "corruption", "pair"])
-    return frame.assign(backbone="", method="unregistered", cd=frame["cd_unregistered"])
+def _decided(metrics: pd.DataFrame, value: str, spread: float) -> pd.DataFrame:
+    """``verdicts`` against the control: by level on clean targets, pooled on others."""
+    found = verdicts(metrics, "lambda0", value, spread=spread)
+    return found[found["level"].notna() == (found["condition"] == CLEAN)]
+
+
+def _sorted(frame: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
+    orders = {
+        "condition": names.CONDITIONS,
+        "backbone": ["", *names.BACKBONES],
+        "method": names.METHODS,
+    }
+
+    def ranks(column: pd.Series) -> pd.Series:
+        order = orders.get(column.name)
+        return column if order is None else column.map(lambda name: rank(name, order))
+
+    return frame.sort_values(keys, key=ranks, kind="stable", ignore_index=True)
 
 
 def _compare(
-    dataset: str,
-    metrics: pd.DataFrame,
-    conditions: tuple[str, ...],
-    value: str = "cd",
-    scale: float = CD_SCALE,
-    reference: pd.DataFrame | None = None,
-    spread: float = 0.0,
+    dataset: str, metrics: pd.DataFrame, kind: Kind, reference: pd.DataFrame, spread: float
 ) -> pd.DataFrame:
     """Tidy numbers of one dataset: ours and, where ``reference`` has them, the published ones.
 
     With what each method differs by from the control, as ``statistics.verdicts`` says it.
     """
-    rows = metrics[(metrics["dataset"] == dataset) & metrics["condition"].isin(conditions)]
-    rows = rows[rows[value].notna()]
-    decided = verdicts(rows, "lambda0", value, spread=spread)
-    if value == "cd":
-        rows = pd.concat([rows, _unregistered(rows)])
-    clean = rows["condition"] == "deformation"
-    ours = pd.concat(
-        [summary(rows[clean], value, scale), summary(rows[~clean], value, scale, pool_levels=True)]
-    ).drop(columns="dataset")
-    if reference is None:
-        reference = published().iloc[:0]
-    reference = reference[
-        (reference["dataset"] == dataset) & reference["condition"].isin(conditions)
+    rows = metrics[(metrics["dataset"] == dataset) & metrics["condition"].isin(kind.conditions)]
+    rows = rows[rows[kind.value].notna()]
+    decided = _decided(rows, kind.value, spread)
+    if kind.value == "cd":
+        # The source as it is, as a method of no backbone: every method shares the same pairs.
+        first = rows.drop_duplicates(["condition", "corruption", "pair"])
+        bare = {"backbone": "", "method": "unregistered", "cd": first["cd_unregistered"]}
+        rows = pd.concat([rows, first.assign(**bare)])
+    clean = rows["condition"] == CLEAN
+    means = [
+        summary(rows[some], kind.value, kind.scale, pool_levels=pooled)
+        for some, pooled in ((clean, False), (~clean, True))
     ]
-    data = ours.merge(
-        reference[[*_SETTING, *_SERIES, "published_mean", "published_std"]],
-        on=[*_SETTING, *_SERIES],
-        how="outer",
-    )
+    keys = [*_SETTING, *_SERIES]
+    data = pd.concat(means).drop(columns="dataset")
+    data = data.merge(reference[[*keys, "published_mean", "published_std"]], on=keys, how="outer")
     data["n"] = data["n"].fillna(0).astype(int)
-    clean = decided["condition"] == CLEAN
-    decided = decided[decided["level"].notna() == clean]
-    data = data.merge(
-        decided[[*_SETTING, *_SERIES, "relative", "low", "high", "verdict"]],
-        on=[*_SETTING, *_SERIES],
-        how="left",
-    )
+    columns = [*keys, "relative", "low", "high", "verdict"]
+    data = data.merge(decided[columns], on=keys, how="left")
     data["verdict"] = data["verdict"].fillna("")
     data.insert(0, "dataset", dataset)
     data.insert(1, "origin", origin_of(dataset, metrics) or "")
-    return data.sort_values([*_SETTING, *_SERIES], key=_sort_key, kind="stable", ignore_index=True)
-
-
-def _sort_key(column: pd.Series) -> pd.Series:
-    known = {
-        "condition": CONDITION_NAMES,
-        "backbone": {"": "", **BACKBONE_NAMES},
-        "method": METHOD_NAMES,
-    }.get(column.name)
-    return column if known is None else column.map(lambda name: rank(name, known))
-
-
-def rank(name: str, known: Iterable[str]) -> str:
-    """A sort key: known names in their order, then the others by alphabet."""
-    order = list(known)
-    return f"{order.index(name) if name in order else len(order):03d} {name}"
+    return _sorted(data, keys)
 
 
 def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
@@ -306,34 +180,32 @@ def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
     interval and ``verdict`` what follows, as of ``statistics.verdicts``. Only pairs evaluated with
     every method present count; columns of a method that was not run are missing.
     """
-    frame = _rounded(metrics)
-    decided = verdicts(frame, "lambda0", spread=spread)
-    decided = decided[decided["level"].notna() == (decided["condition"] == CLEAN)]
+    frame = rounded(metrics)
     frame["cd"] = CD_SCALE * frame["cd"]
-    frame.loc[frame["condition"] != "deformation", "level"] = np.nan
+    frame["level"] = frame["level"].where(frame["condition"] == CLEAN)
     records = []
     keys = ["dataset", "backbone", *_SETTING]
     for key, rows in frame.groupby(keys, dropna=False):
         wide = rows.pivot(index="pair", columns="method", values="cd").dropna()
         if wide.empty:
             continue
-        mean = wide.mean().reindex([*BASELINES, *wide.columns.difference(BASELINES)])
-        for method in mean.index[len(BASELINES) :]:
-            control = wide.get("lambda0")
+        priors = wide.columns.difference(BASELINES)
+        mean = wide.mean().reindex([*BASELINES, *priors])
+        stage1, control = mean["stage1"], mean["lambda0"]
+        for method in priors:
+            better = (wide[method] < wide["lambda0"]).mean() if "lambda0" in wide else np.nan
             records.append(
                 {
                     **dict(zip(keys, key, strict=True)),
                     "method": method,
                     "n": len(wide),
-                    "stage1_mean": mean["stage1"],
-                    "lambda0_mean": mean["lambda0"],
+                    "stage1_mean": stage1,
+                    "lambda0_mean": control,
                     "mean": mean[method],
-                    "lambda0_gain_over_stage1": _gain(mean["stage1"], mean["lambda0"]),
-                    "gain_over_stage1": _gain(mean["stage1"], mean[method]),
-                    "gain_over_lambda0": _gain(mean["lambda0"], mean[method]),
-                    "pairs_better_than_lambda0": np.nan
-                    if control is None
-                    else 100 * float((wide[method] < control).mean()),
+                    "lambda0_gain_over_stage1": _gain(stage1, control),
+                    "gain_over_stage1": _gain(stage1, mean[method]),
+                    "gain_over_lambda0": _gain(control, mean[method]),
+                    "pairs_better_than_lambda0": 100 * better,
                 }
             )
     columns = [
@@ -342,13 +214,12 @@ def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
         "pairs_better_than_lambda0",
     ]
     found = pd.DataFrame(records, columns=columns)
+    keys = ["dataset", *_SERIES, *_SETTING]
+    decided = _decided(metrics, "cd", spread)
     # An interval of the difference, turned into one of the reduction.
     turned = decided.assign(low=-decided["high"], high=-decided["low"])
-    turned = turned[["dataset", *_SERIES, *_SETTING, "low", "high", "verdict"]]
-    found = found.merge(turned, on=["dataset", *_SERIES, *_SETTING], how="left")
-    return found.sort_values(
-        ["dataset", *_SERIES, *_SETTING], key=_sort_key, kind="stable", ignore_index=True
-    )
+    found = found.merge(turned[[*keys, "low", "high", "verdict"]], on=keys, how="left")
+    return _sorted(found, keys)
 
 
 def _gain(before: float, after: float) -> float:
@@ -358,57 +229,18 @@ def _gain(before: float, after: float) -> float:
 # --------------------------------------------------------------------------------- tables
 
 
-def paper_table(number: int, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
-    """Table 1, 2 or 3 of the paper: this run's values with the published ones beneath.
+def mean_table(kind: str, dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
+    """Means of one of ``KINDS`` by method and setting, with the published ones beneath.
 
     Levels of the run that the paper lacks, and the reverse, both appear.
     """
-    dataset, conditions = _PAPER_TABLES[number]
-    frame = published()
-    return _cd_table(dataset, metrics, conditions, frame[frame["table"] == number], number, spread)
-
-
-def deformation_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
-    """Chamfer distance by deformation level: Table 1 or 2 where the paper has one."""
-    return _any_table(dataset, metrics, (CLEAN,), spread)
-
-
-def corruption_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
-    """Chamfer distance under outliers and noise: Table 3 where the paper has one."""
-    return _any_table(dataset, metrics, CORRUPTIONS, spread)
-
-
-def _any_table(
-    dataset: str, metrics: pd.DataFrame, conditions: tuple[str, ...], spread: float
-) -> Table:
-    for number, content in _PAPER_TABLES.items():
-        if content == (dataset, conditions):
-            return paper_table(number, metrics, spread)
-    return _cd_table(dataset, metrics, conditions, None, None, spread)
-
-
-def _cd_table(
-    dataset: str,
-    metrics: pd.DataFrame,
-    conditions: tuple[str, ...],
-    reference: pd.DataFrame | None,
-    number: int | None,
-    spread: float,
-) -> Table:
-    data = _compare(dataset, metrics, conditions, reference=reference, spread=spread)
-    clean = conditions == ("deformation",)
-    title = "Increasing deformation" if clean else "Outliers and noise"
-    caption = [
-        _origin_sentence(dataset, metrics, reference is not None),
-        "Chamfer distance in units of 10⁻⁴",
-        "to the target:"
-        if clean
-        else "to the clean target under outliers (% of the points) and Gaussian noise (σ), pooled "
-        "over deformation levels:",
-        "mean ± sample standard deviation over test pairs; lower is better.",
-        _BOLD,
-    ]
-    if (data["method"] == "lambda0").any():
+    about = KINDS[kind]
+    clean = about.conditions == (CLEAN,)
+    number = PAPER_TABLES.get((dataset, not clean)) if about.in_paper else None
+    paper = published()
+    data = _compare(dataset, metrics, about, paper[paper["table"] == number], spread)
+    caption = [_origin_sentence(dataset, metrics, number is not None), about.caption]
+    if about.in_paper and (data["method"] == "lambda0").any():
         caption.append(
             "The control is trained like the priors, from the same start with the same steps and "
             "seed, but with λ = 0."
@@ -418,49 +250,19 @@ def _cd_table(
             "The paper has no values for the unregistered source and the control"
             + ("." if clean else ", and does not say how it combined deformation levels here.")
         )
+    title = f"{about.title}: {display_name(dataset)}"
+    layout = _layout(data, about.decimals, number is not None)
+    if not about.in_paper:
+        data = data.drop(columns=["published_mean", "published_std"])
+    if about.scale != 1:
+        scaled = ("mean", "std", "published_mean", "published_std")
+        data = data.rename(columns={name: f"{name}_1e-4" for name in scaled})
     return Table(
-        name=table_name(dataset, corrupted=not clean),
-        title=f"{title}: {display_name(dataset)}"
-        + (f" (Table {number} of the paper)" if number else ""),
+        name=table_name(dataset, not clean) if about.in_paper else f"{kind}_{dataset}",
+        title=f"{title} (Table {number} of the paper)" if number else title,
         caption=" ".join(caption),
-        **_layout(data, decimals=2, with_paper=reference is not None),
-        data=data.rename(
-            columns={
-                name: f"{name}_1e-4" for name in ("mean", "std", "published_mean", "published_std")
-            }
-        ),
-    )
-
-
-def correspondence_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
-    """Mean correspondence error in every setting; pairs without correspondences do not count."""
-    data = _compare(dataset, metrics, tuple(CONDITION_NAMES), "mce", 1.0, spread=spread)
-    return Table(
-        name=f"correspondence_{dataset}",
-        title=f"Correspondence error: {display_name(dataset)}",
-        caption=f"{_origin_sentence(dataset, metrics, False)} Mean distance between a "
-        "registered point and its true counterpart, in the normalised frame, mean ± sample "
-        "standard deviation over test pairs; lower is better. Unlike the Chamfer distance it sees "
-        f"points that slid along the surface. {_BOLD}",
-        **_layout(data, decimals=4, with_paper=False),
-        data=data.drop(columns=["published_mean", "published_std"]),
-    )
-
-
-def observed_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
-    """Table 3's settings against the corrupted target that the model sees."""
-    data = _compare(dataset, metrics, CORRUPTIONS, "cd_observed", spread=spread)
-    return Table(
-        name=f"observed_{dataset}",
-        title=f"Against the observed target: {display_name(dataset)}",
-        caption=f"{_origin_sentence(dataset, metrics, False)} Chamfer distance to the "
-        "observed target, with its outliers and noise, in units of 10⁻⁴, mean ± sample standard "
-        "deviation over test pairs. A method that follows the corruption scores well here and "
-        f"badly against the clean target. {_BOLD}",
-        **_layout(data, decimals=2, with_paper=False),
-        data=data.drop(columns=["published_mean", "published_std"]).rename(
-            columns={"mean": "mean_1e-4", "std": "std_1e-4"}
-        ),
+        **layout,
+        data=data,
     )
 
 
@@ -468,36 +270,32 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
     """What does the prior add over longer training? The rows of ``gains`` for one dataset."""
     data = gains(metrics[metrics["dataset"] == dataset], spread)
     data.insert(1, "origin", origin_of(dataset, metrics) or "")
-    rows = []
-    for row in data.itertuples(index=False):
-        rows.append(
-            tuple(
-                Cell(text)
-                for text in (
-                    display_name(row.backbone),
-                    display_name(row.method),
-                    *_setting_label(row.condition, row.corruption, row.level),
-                    str(row.n),
-                    _signed(row.lambda0_gain_over_stage1),
-                    _signed(row.gain_over_stage1),
-                    _signed(row.gain_over_lambda0),
-                    _interval(row.low, row.high),
-                    _DASH if pd.isna(row.verdict) else row.verdict,
-                    _DASH
-                    if np.isnan(row.pairs_better_than_lambda0)
-                    else f"{row.pairs_better_than_lambda0:.0f} %",
-                )
-            )
-        )
-    header = (
-        *(("", label) for label in ("Backbone", "Prior", "Setting", "Level", "Pairs")),
-        ("Reduction of the mean CD", "Control over Stage 1"),
-        ("Reduction of the mean CD", "Prior over Stage 1"),
-        ("Reduction of the mean CD", "Prior over control"),
-        ("Reduction of the mean CD", "95 % interval"),
-        ("", "Verdict"),
-        ("", "Pairs better than control"),
-    )
+    chance = f", and of the training, from run to run ± {100 * spread:g} % (standard deviation)"
+    rows = data.to_dict("records")
+    settings = [_setting_label(row) for row in rows]
+    columns: Columns = {
+        ("", "Backbone"): data["backbone"].map(display_name),
+        ("", "Prior"): data["method"].map(display_name),
+        ("", "Setting"): [setting for setting, _ in settings],
+        ("", "Level"): [level for _, level in settings],
+        ("", "Pairs"): data["n"],
+    }
+    reduction = "Reduction of the mean CD"
+    for label, name in (
+        ("Control over Stage 1", "lambda0_gain_over_stage1"),
+        ("Prior over Stage 1", "gain_over_stage1"),
+        ("Prior over control", "gain_over_lambda0"),
+    ):
+        columns[reduction, label] = [names.percent(value, 1) for value in data[name]]
+    columns[reduction, "95 % interval"] = [
+        DASH if np.isnan(row["low"]) else f"{names.interval(row['low'], row['high'])} %"
+        for row in rows
+    ]
+    columns["", "Verdict"] = data["verdict"].fillna(DASH)
+    better = data["pairs_better_than_lambda0"]
+    columns["", "Pairs better than control"] = [
+        DASH if np.isnan(value) else f"{value:.0f} %" for value in better
+    ]
     return Table(
         name=f"gains_{dataset}",
         title=f"What does the prior add over longer training? {display_name(dataset)}",
@@ -505,9 +303,8 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
         "Chamfer distance in percent on the pairs that all methods share; negative values are "
         "losses. The control differs from the prior only in λ = 0. The interval is that of the "
         "reduction over the control: of the test pairs, drawn by deformation where the object is "
-        f"known and by object otherwise{_spread_text(spread)}. Undecided: it holds zero.",
-        header=header,
-        rows=tuple(rows),
+        f"known and by object otherwise{chance if spread else ''}. Undecided: it holds zero.",
+        **laid_out(columns),
         data=data.rename(
             columns={name: f"{name}_1e-4" for name in data if name.endswith("mean")}
             | {
@@ -525,26 +322,24 @@ def all_tables(metrics: pd.DataFrame, spread: float = 0.0) -> list[Table]:
     ``spread`` is how much differences vary with the training; see ``statistics.verdicts``.
     """
     tables, comparisons, supplementary = [], [], []
-    for dataset in sorted(metrics["dataset"].unique(), key=lambda name: rank(name, DATASET_NAMES)):
+    for dataset in sorted(metrics["dataset"].unique(), key=lambda name: rank(name, names.DATASETS)):
         rows = metrics[metrics["dataset"] == dataset]
         corrupted = rows["condition"].isin(CORRUPTIONS)
-        if (rows["condition"] == "deformation").any():
-            tables.append(deformation_table(dataset, rows, spread))
+        if (rows["condition"] == CLEAN).any():
+            tables.append(mean_table("deformation", dataset, rows, spread))
         if corrupted.any():
-            tables.append(corruption_table(dataset, rows, spread))
-            supplementary.append(observed_table(dataset, rows, spread))
+            tables.append(mean_table("corruption", dataset, rows, spread))
+            supplementary.append(mean_table("observed", dataset, rows, spread))
         if rows["mce"].notna().any():
-            supplementary.append(correspondence_table(dataset, rows, spread))
-        if len(gains(rows)):
-            comparisons.append(gain_table(dataset, rows, spread))
+            supplementary.append(mean_table("correspondence", dataset, rows, spread))
+        if not set(rows["method"]) <= set(BASELINES):
+            gain = gain_table(dataset, rows, spread)
+            comparisons += [gain] if gain.rows else []
     tables.sort(key=lambda table: (not table.name.startswith("table"), table.name))
     return tables + comparisons + supplementary
 
 
-def origin_of(dataset: str, metrics: pd.DataFrame) -> str | None:
-    """The origin of a dataset's pairs, or None where the metrics have none of it."""
-    origins = metrics.loc[metrics["dataset"] == dataset, "origin"]
-    return None if origins.empty else str(origins.iloc[0])
+# ---------------------------------------------------------------------------------- words
 
 
 def _origin_sentence(dataset: str, metrics: pd.DataFrame, with_paper: bool) -> str:
@@ -554,10 +349,10 @@ def _origin_sentence(dataset: str, metrics: pd.DataFrame, with_paper: bool) -> s
     if origin is None:
         return f"This run has no results on {name}; only the published values are shown."
     rows = metrics[metrics["dataset"] == dataset]
-    objects = " and ".join(OBJECTS_NAMES[kind] for kind in sorted(set(rows["objects"])))
-    if known not in DATASET_NAMES or origin not in ("synthetic", "bases"):
-        return f"DINE on {name} ({ORIGIN_NAMES[origin]}), {objects}."
-    text = f"DINE on {ORIGIN_NAMES[origin]} in the layout of {name}, {objects}"
+    objects = " and ".join(names.OBJECTS[kind] for kind in sorted(set(rows["objects"])))
+    if known not in names.DATASETS or origin not in ("synthetic", "bases"):
+        return f"DINE on {name} ({names.ORIGINS[origin]}), {objects}."
+    text = f"DINE on {names.ORIGINS[origin]} in the layout of {name}, {objects}"
     if with_paper:
         text += (
             f"; published values are on the real {name} data and are not comparable in absolute "
@@ -566,186 +361,49 @@ def _origin_sentence(dataset: str, metrics: pd.DataFrame, with_paper: bool) -> s
     return f"{text}."
 
 
-def _layout(data: pd.DataFrame, decimals: int, with_paper: bool) -> dict:
+def _layout(data: pd.DataFrame, decimals: int, with_paper: bool) -> dict[str, tuple]:
     """Header and display rows: settings down, methods by backbone across, ours above published."""
-    series = data[_SERIES].drop_duplicates().sort_values(_SERIES, key=_sort_key)
-    columns = list(series[series["method"] != "unregistered"].itertuples(index=False, name=None))
-    # Shown even without results of this run, so that an empty table still says what is missing.
-    baseline = [("", "unregistered")] if (series["method"] == "unregistered").any() else []
-    corrupted = bool((data["condition"] != "deformation").any())
-    labels = (["Setting"] if corrupted else []) + ["Level"]
+    series = _sorted(data[_SERIES].drop_duplicates(), _SERIES)
+    bare = series["method"] == "unregistered"
+    series = pd.concat([series[bare], series[~bare]])
+    labels = ["Setting", "Level"] if (data["condition"] != CLEAN).any() else ["Level"]
     header = [("", label) for label in [*labels, *(["Values"] if with_paper else []), "Pairs"]]
-    header += [("", display_name(method)) for _, method in baseline]
-    header += [(display_name(backbone), display_name(method)) for backbone, method in columns]
+    header += [tuple(map(display_name, key)) for key in series.itertuples(index=False)]
     rows = []
-    for setting, values in data.groupby(_SETTING, dropna=False, sort=False):
-        label = [Cell(text) for text in _setting_label(*setting)][-len(labels) :]
-        values = values.set_index(_SERIES)
-        ours, paper = [], []
-        for key in [*baseline, *columns]:
-            if key not in values.index:
-                ours.append(Cell(_DASH))
-                paper.append(Cell(_DASH))
-                continue
-            value = values.loc[key]
-            text = _plus_minus(value["mean"], value["std"], decimals)
-            ours.append(Cell(text, value["verdict"] == "lower"))
-            # The paper prints its Table 3 with one decimal.
-            digits = 2 if setting[0] == "deformation" else 1
-            paper.append(Cell(_plus_minus(value["published_mean"], value["published_std"], digits)))
-        source = [Cell("this run")] if with_paper else []
-        rows.append((*label, *source, Cell(_count(values["n"])), *ours))
+    for _, values in data.groupby(_SETTING, dropna=False, sort=False):
+        label = _setting_label(values.iloc[0])[-len(labels) :]
+        found = series.merge(values, on=_SERIES, how="left").to_dict("records")
+        means = [
+            Cell(mean_and_deviation(x["mean"], x["std"], decimals), x["verdict"] == "lower")
+            for x in found
+        ]
+        head = [*label, *(["this run"] if with_paper else []), _count(values)]
+        rows.append((*map(Cell, head), *means))
         if with_paper:
-            blank = [Cell("")] * len(label)
-            rows.append((*blank, Cell("paper"), Cell(_DASH), *paper))
+            # The paper prints its Table 3 with one decimal.
+            digits = 1 if "Setting" in labels else 2
+            head = [*("" for _ in labels), "paper", DASH]
+            head += [
+                mean_and_deviation(x["published_mean"], x["published_std"], digits) for x in found
+            ]
+            rows.append(tuple(map(Cell, head)))
     return {"header": tuple(header), "rows": tuple(rows)}
 
 
-def display_name(key: str) -> str:
-    """The name to show for a dataset, backbone or method; unknown ones are shown as they are."""
-    known = trained_on(key)
-    if known != key:
-        return f"{display_name(known)}, {OBJECTS_NAMES[UNSEEN]}"
-    return {**DATASET_NAMES, **BACKBONE_NAMES, **METHOD_NAMES}.get(key, key)
-
-
-def setting_text(condition: str, corruption: float) -> str:
-    """A condition and its strength, in words."""
-    if condition == "noise":
-        return f"Noise σ = {corruption:g}"
-    if condition == "outliers":
-        return f"{corruption:g} % outliers"
-    return "Clean" if condition == "deformation" else CONDITION_NAMES[condition]
-
-
-def _setting_label(condition: str, corruption: float, level: float) -> tuple[str, str]:
+def _setting_label(row: Mapping[str, Any]) -> tuple[str, str]:
+    condition, corruption, level = (row[name] for name in _SETTING)
     if condition == "outliers":
         return "Outliers", f"{corruption:g} %"
     if condition == "noise":
         return "Noise", f"σ = {corruption:g}"
-    if condition != "deformation":
-        return CONDITION_NAMES.get(condition, condition), _DASH
+    if condition != CLEAN:
+        return names.CONDITIONS.get(condition, condition), DASH
     return "Deformation", "not given" if np.isnan(level) else f"{level:g}"
 
 
-def _plus_minus(mean: float, std: float, decimals: int) -> str:
-    if np.isnan(mean):
-        return _DASH
-    return f"{mean:.{decimals}f}" + ("" if np.isnan(std) else f" ± {std:.{decimals}f}")
-
-
-def _count(counts: pd.Series) -> str:
-    counts = counts[counts > 0]
+def _count(values: pd.DataFrame) -> str:
+    counts = values.loc[values["n"] > 0, "n"]
     if counts.empty:
-        return _DASH
+        return DASH
     low, high = counts.min(), counts.max()
-    return f"{low}" if low == high else f"{low}{_DASH}{high}"
-
-
-def _interval(low: float, high: float) -> str:
-    if np.isnan(low):
-        return _DASH
-    return f"{low:+.0f} to {high:+.0f} %".replace("-", "−")
-
-
-def _spread_text(spread: float) -> str:
-    """What an interval holds besides the chance of the pairs."""
-    if not spread:
-        return ""
-    return f", and of the training, from run to run ± {100 * spread:g} % (standard deviation)"
-
-
-def _signed(percent: float) -> str:
-    return _DASH if np.isnan(percent) else f"{percent:+.1f} %".replace("-", "−")
-
-
-# -------------------------------------------------------------------------------- writing
-
-
-def write_table(table: Table, path_stem: str | os.PathLike) -> list[Path]:
-    """Write ``<stem>.csv`` (tidy numbers), ``<stem>.md`` and ``<stem>.tex``; return the paths."""
-    paths = [Path(f"{path_stem}.{suffix}") for suffix in ("csv", "md", "tex")]
-    with atomic_path(paths[0]) as temporary:
-        table.data.to_csv(temporary, index=False, float_format="%.10g")
-    write_text(paths[1], to_markdown(table))
-    write_text(paths[2], to_latex(table))
-    return paths
-
-
-def to_markdown(table: Table) -> str:
-    """A GitHub-style table under its title, with the caption beneath."""
-    lines = [f"### {_markdown(table.title)}", ""]
-    names = [_markdown(f"{group}: {label}" if group else label) for group, label in table.header]
-    lines += [f"| {' | '.join(names)} |", f"|{' --- |' * len(names)}"]
-    for row in table.rows:
-        cells = [f"**{_markdown(c.text)}**" if c.bold else _markdown(c.text) for c in row]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, "", _markdown(table.caption), ""])
-
-
-def _markdown(text: str) -> str:
-    return re.sub(r"([\\`*_|<\[\]])", r"\\\1", text)
-
-
-def to_latex(table: Table) -> str:
-    """A booktabs table to ``\\input``; needs the packages booktabs and graphicx."""
-    columns = "".join("c" if group else "l" for group, _ in table.header)
-    # Shrinks a wide table to the text width as the paper does, but never enlarges a narrow one.
-    width = r"\ifdim\width>\textwidth\textwidth\else\width\fi"
-    lines = [
-        r"% Needs \usepackage{booktabs} and \usepackage{graphicx}.",
-        r"\begin{table}[t]",
-        r"\centering",
-        rf"\caption{{{_latex(table.title)}. {_latex(table.caption)}}}",
-        rf"\label{{tab:{re.sub('[^a-z0-9]+', '-', table.name.lower())}}}",
-        rf"\resizebox{{{width}}}{{!}}{{%",
-        rf"\begin{{tabular}}{{{columns}}}",
-        r"\toprule",
-        *_latex_groups(table.header),
-        " & ".join(_latex(label) for _, label in table.header) + r" \\",
-        r"\midrule",
-    ]
-    for row in table.rows:
-        cells = [rf"\textbf{{{_latex(c.text)}}}" if c.bold else _latex(c.text) for c in row]
-        lines.append(" & ".join(cells) + r" \\")
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}%", "}", r"\end{table}", ""])
-
-
-def header_groups(header: tuple[tuple[str, str], ...]) -> list[tuple[str, int]]:
-    """Runs of columns under one heading, as (group, number of columns)."""
-    groups: list[tuple[str, int]] = []
-    for group, _ in header:
-        if groups and groups[-1][0] == group:
-            groups[-1] = (group, groups[-1][1] + 1)
-        else:
-            groups.append((group, 1))
-    return groups
-
-
-def _latex_groups(header: tuple[tuple[str, str], ...]) -> list[str]:
-    cells, rules, start = [], [], 1
-    for group, width in header_groups(header):
-        cells.append(rf"\multicolumn{{{width}}}{{c}}{{{_latex(group)}}}")
-        if group:
-            rules.append(rf"\cmidrule(lr){{{start}-{start + width - 1}}}")
-        start += width
-    return [" & ".join(cells) + r" \\", "".join(rules)] if rules else []
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-    "±": r"$\pm$",
-    "10⁻⁴": r"$10^{-4}$",
-    "λ": r"$\lambda$",
-    "σ": r"$\sigma$",
-    "−": "$-$",
-    "–": "--",
-}
-_LATEX_PATTERN = re.compile("|".join(re.escape(text) for text in _LATEX))
-
-
-def _latex(text: str) -> str:
-    return _LATEX_PATTERN.sub(lambda match: _LATEX[match[0]], text)
+    return f"{low}" if low == high else f"{low}{DASH}{high}"

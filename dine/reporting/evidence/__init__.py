@@ -1,12 +1,11 @@
 """Does a deformation prior help, which one, where and by how much: the report on the evidence.
 
 Every number comes from ``metrics.csv`` files by way of ``dine.evaluation.statistics``; so do the
-sentences. A *place* is a dataset with a backbone. Methods without a network are shown at every
-place of their datasets.
+verdicts. A *place* is a dataset with a backbone. Methods without a network are shown at every place
+of their datasets.
 """
 
 from dine.reporting.evidence.comparisons import Evidence, load_evidence
-from dine.reporting.evidence.examples import draw_examples
-from dine.reporting.evidence.report import Picture, build_evidence
+from dine.reporting.evidence.report import Example, Files, build_evidence
 
-__all__ = ["Evidence", "Picture", "build_evidence", "draw_examples", "load_evidence"]
+__all__ = ["Evidence", "Example", "Files", "build_evidence", "load_evidence"]

@@ -1,4 +1,4 @@
-"""The metrics, and how every method compares with the reference on them."""
+"""How every method compares with the reference."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from dine.config import CONTROL
 from dine.errors import DataError
 from dine.evaluation import statistics
 from dine.evaluation.statistics import NO_BACKBONE
-from dine.reporting import tables
-from dine.reporting.evidence.wording import join
-from dine.reporting.tables import display_name
+from dine.reporting import names
+from dine.reporting.loading import origin_of, read_metrics
+from dine.reporting.names import display_name, rank
 from dine.results import CLEAN
 
 GROUPS = {
@@ -34,71 +34,14 @@ GROUPS = {
 PAPER_PRIOR = "pca"
 LARGE = 0.4
 """Deformation level from which on deformations count as large."""
-SIGNIFICANT = 0.05
 
-_KEYS = ["dataset", "backbone", "method", "seed", "condition", "corruption", "pair"]
-_TEXT = ("dataset", "backbone", "method", "origin", "pair", "object", "cluster", "condition")
 _NUMBERS = ("seed", "level", "corruption", *statistics.SUMMARISED, "roughness_true")
-# Numbers that evaluate may leave out: unknown level or correspondences, time that was not measured.
-_MAY_LACK = {"level", "seconds", "mce", "accuracy_2_5", "accuracy_5", "far_points"}
-_DECIMALS = 6  # levels and corruptions that passed through float32 must still meet
-
-
-# ------------------------------------------------------------------------------------------- input
+_PLACE = ["dataset", "backbone"]
 
 
 def load_evidence(paths: Iterable[Path]) -> pd.DataFrame:
-    """Read ``metrics.csv`` files of any datasets, backbones, methods and seeds into one frame.
-
-    Raises:
-        DataError: a file is missing, lacks a column or holds values that cannot be used, the same
-            evaluation stands in two rows, or a dataset mixes origins.
-    """
-    return tables.combined([_load_one(Path(path)) for path in paths], _KEYS)
-
-
-def _load_one(path: Path) -> pd.DataFrame:
-    try:
-        # As text first: a pair may be called "NA" or "007".
-        frame = pd.read_csv(path, dtype=str, keep_default_na=False)
-    except FileNotFoundError as error:
-        raise DataError(f"{path} does not exist.") from error
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} is not a readable CSV file ({error}).") from error
-    missing = [name for name in (*_TEXT, *_NUMBERS) if name not in frame]
-    if missing:
-        raise DataError(f"{path} lacks the column(s) {', '.join(missing)}; evaluate again.")
-    if frame.empty:
-        raise DataError(f"{path} holds no rows.")
-    frame = frame[[*_TEXT, *_NUMBERS]]
-    for name in _TEXT:
-        if (frame[name] == "").any():
-            raise DataError(f"{path}: column {name} is empty in some rows.")
-    for name in _NUMBERS:
-        try:
-            numbers = pd.to_numeric(frame[name]).astype(float)
-        except (TypeError, ValueError) as error:
-            raise DataError(f"{path}: column {name} is not numeric ({error}).") from error
-        bad = np.isinf(numbers) | (numbers.isna() if name not in _MAY_LACK else False)
-        if bad.any():
-            raise DataError(
-                f"{path}: column {name} holds {frame.loc[bad, name].iloc[0] or 'nothing'} in data "
-                f"row {int(np.argmax(bad)) + 1}; it must be a finite number."
-            )
-        frame[name] = numbers.round(_DECIMALS) if name in ("level", "corruption") else numbers
-    for name, allowed in (
-        ("condition", tables.CONDITION_NAMES),
-        ("origin", tables.ORIGIN_NAMES),
-    ):
-        unknown = frame.loc[~frame[name].isin(list(allowed)), name]
-        if len(unknown):
-            raise DataError(
-                f"{path}: unknown {name} {unknown.iloc[0]!r}; expected one of {', '.join(allowed)}."
-            )
-    return frame.astype({"seed": int})
-
-
-# -------------------------------------------------------------------------------------- statistics
+    """``read_metrics``, with all that the tables here summarise."""
+    return read_metrics(paths, _NUMBERS)
 
 
 @dataclass(frozen=True)
@@ -116,15 +59,11 @@ class Method:
 
 
 def _known_methods(
-    metrics: pd.DataFrame, described: Mapping[str, Mapping[str, Any]]
+    present: Sequence[str], described: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Method]:
     """The methods of the metrics in the order of the tables."""
-    present = list(metrics["method"].unique())
     found = []
-    for name in [
-        *(n for n in described if n in present),
-        *(n for n in present if n not in described),
-    ]:
+    for name in dict.fromkeys([*(n for n in described if n in present), *present]):
         entry = described.get(name, {})
         group = str(entry.get("group", "other"))
         if group not in GROUPS:
@@ -141,12 +80,15 @@ def _known_methods(
 class Evidence:
     """The statistics behind the report, each computed once and only when it is asked for.
 
+    A *place* is a dataset with a backbone.
+
     Args:
         metrics: as ``load_evidence`` returns them.
         methods: title, group and description by method; see ``build_evidence``.
         reference: what all methods are compared with.
         aside: backbones and datasets that are shown, but neither count for the goal nor for the
             order of methods.
+        spread: how much differences vary with the training; see ``statistics.decided``.
 
     Raises:
         DataError: the reference is missing, nothing can be compared with it, or a group is unknown.
@@ -158,10 +100,12 @@ class Evidence:
         methods: Mapping[str, Mapping[str, Any]],
         reference: str = CONTROL,
         aside: Collection[str] = (),
+        spread: float = 0.0,
     ):
         self.metrics = metrics
-        self.methods = _known_methods(metrics, methods)
+        self.methods = _known_methods(list(metrics["method"].unique()), methods)
         self.reference = reference
+        self.spread = spread
         self.clean = metrics[metrics["condition"] == CLEAN]
         if not (self.clean["method"] == reference).any():
             raise DataError(
@@ -182,13 +126,8 @@ class Evidence:
             for dataset, rows in self.metrics.groupby("dataset")
             for backbone in set(rows["backbone"]) - {NO_BACKBONE} or {NO_BACKBONE}
         }
-        return sorted(
-            found,
-            key=lambda place: (
-                tables.rank(place[0], tables.DATASET_NAMES),
-                tables.rank(place[1], tables.BACKBONE_NAMES),
-            ),
-        )
+        orders = (names.DATASETS, names.BACKBONES)
+        return sorted(found, key=lambda place: tuple(map(rank, place, orders)))
 
     @property
     def datasets(self) -> list[str]:
@@ -197,16 +136,12 @@ class Evidence:
     def title(self, method: str) -> str:
         return self.methods[method].title
 
-    def titles(self, methods: Iterable[str]) -> str:
-        return join([self.title(name) for name in methods])
-
     def origin(self, dataset: str) -> str | None:
-        return tables.origin_of(dataset, self.metrics)
+        return origin_of(dataset, self.metrics)
 
     def where(self, dataset: str, backbone: str | None = None) -> str:
         """A place as captions name it; data that were made are always said to be."""
-        origin = self.origin(dataset)
-        text = f"{display_name(dataset)} ({tables.ORIGIN_NAMES[origin]})"
+        text = f"{display_name(dataset)} ({names.ORIGINS[self.origin(dataset)]})"
         return text if backbone in (None, NO_BACKBONE) else f"{text}, {display_name(backbone)}"
 
     def of_group(self, *groups: str) -> list[str]:
@@ -232,41 +167,35 @@ class Evidence:
 
     @functools.cached_property
     def comparisons(self) -> pd.DataFrame:
-        """``compare`` of every method with the reference, with a ``verdict``."""
-        return self._compare_all(self.metrics)
+        """``statistics.comparisons`` of every method, in their order, with what follows.
+
+        ``verdict`` is of the test (``statistics.significant``); ``low``, ``high`` and ``decided``
+        are those of ``statistics.decided``, which also holds the chance of the training.
+        """
+        return self._compared(self.metrics)
 
     @functools.cached_property
     def large(self) -> pd.DataFrame:
         """The same for clean targets of all large levels together."""
         # Without a level each pair counts only among all.
-        found = self._compare_all(self.large_rows.assign(level=np.nan))
-        return self.comparisons.iloc[:0] if found.empty else found
+        return self._compared(self.large_rows.assign(level=np.nan))
 
-    def _compare_all(self, metrics: pd.DataFrame) -> pd.DataFrame:
-        found = [self._compare(metrics, name) for name in self.methods if name != self.reference]
-        found = [table for table in found if table is not None]
-        if not found:
-            return pd.DataFrame()
-        table = pd.concat(found, ignore_index=True)
-        sure = table["p_holm"] < SIGNIFICANT
-        verdict = np.where(table["difference"] < 0, "lower", "higher")
-        return table.assign(verdict=np.where(sure & (table["difference"] != 0), verdict, "none"))
+    def _compared(self, metrics: pd.DataFrame) -> pd.DataFrame:
+        table = statistics.comparisons(metrics, self.reference)
+        if table.empty:
+            return table.reindex(columns=[*table.columns, "verdict"])
+        found = statistics.decided(table, self.spread).rename(columns={"verdict": "decided"})
+        table = table.assign(verdict=statistics.significant(table)).join(found)
+        return self._in_order(table, "method", *_PLACE)
 
-    def _compare(self, metrics: pd.DataFrame, method: str) -> pd.DataFrame | None:
-        """On the pairs that both were evaluated on, since slow methods may have seen fewer."""
-        ours, theirs = (metrics[metrics["method"] == x] for x in (method, self.reference))
-        if not set(self._places_of(ours)) & set(self._places_of(theirs)):
-            return None
-        keys = ["dataset", "condition", "corruption", "pair"]
-        shared = ours[keys].drop_duplicates().merge(theirs[keys].drop_duplicates())
-        if shared.empty:
-            return None
-        rows = pd.concat([ours.merge(shared), theirs.merge(shared)])
-        return statistics.compare(rows, method, self.reference)
-
-    def _places_of(self, rows: pd.DataFrame) -> list[tuple[str, str]]:
-        known = set(zip(rows["dataset"], rows["backbone"], strict=True))
-        return [p for p in self.places if p in known or (p[0], NO_BACKBONE) in known]
+    def _in_order(self, table: pd.DataFrame, *keys: str) -> pd.DataFrame:
+        order = list(self.methods)
+        return table.sort_values(
+            list(keys),
+            key=lambda column: column.map(order.index) if column.name == "method" else column,
+            kind="stable",
+            ignore_index=True,
+        )
 
     @functools.cached_property
     def cells(self) -> pd.DataFrame:
@@ -274,15 +203,10 @@ class Evidence:
         table = self.comparisons
         return table[(table["condition"] == CLEAN) & table["level"].notna()]
 
-    @functools.cached_property
-    def judged_cells(self) -> pd.DataFrame:
-        """Those of the places that count."""
-        return pd.concat([at(self.cells, place) for place in self.judged])
-
-    def overall(self, place: tuple[str, str]) -> pd.DataFrame:
-        """``comparisons`` on clean targets of all levels together at a place."""
+    def overall(self, place: tuple[str, str], condition: str = CLEAN) -> pd.DataFrame:
+        """``comparisons`` under a condition, all levels together, at a place."""
         table = at(self.comparisons, place)
-        return table[(table["condition"] == CLEAN) & table["level"].isna()]
+        return table[(table["condition"] == condition) & table["level"].isna()]
 
     @functools.cached_property
     def goal(self) -> pd.DataFrame:
@@ -290,38 +214,40 @@ class Evidence:
 
         ``levels``: large levels of the reference there; ``both``: of these, with a significantly
         lower mean of both values; ``both_lower``: the same without a test; ``mce``, ``cd``: with a
-        significantly lower one of these; ``worse``: with a significantly higher one of any.
+        significantly lower one of these; ``worse``: with a significantly higher one of any. Of all
+        levels at which a classical method was evaluated on all pairs (``classical_levels``),
+        ``below_classical_mce`` and ``below_classical_cd``: with a lower mean than the best of them.
         """
-        records = []
-        large = self.cells[self.cells["level"] >= LARGE]
-        for place in self.judged:
-            here = at(self.large_rows, place)
-            levels = here.loc[here["method"] == self.reference, "level"].nunique()
-            for method in self.rivals:
-                some = at(large, place)
-                some = some[some["method"] == method]
-                if some.empty:
-                    continue
-                lower = some.assign(is_=some["difference"] < 0).pivot(
-                    index="level", columns="value", values="is_"
-                )
-                verdict = some.pivot(index="level", columns="value", values="verdict")
-                verdict = verdict.reindex(columns=["mce", "cd"])
-                records.append(
-                    {
-                        **dict(zip(("dataset", "backbone"), place, strict=True)),
-                        "method": method,
-                        "levels": levels,
-                        "both": int((verdict == "lower").all(axis=1).sum()),
-                        "both_lower": int(
-                            lower.reindex(columns=["mce", "cd"]).eq(True).all(axis=1).sum()
-                        ),
-                        **{v: int((verdict[v] == "lower").sum()) for v in ("mce", "cd")},
-                        "worse": int((verdict == "higher").any(axis=1).sum()),
-                    }
-                )
-        columns = [*("dataset", "backbone", "method", "levels", "both", "both_lower"), "mce", "cd"]
-        return pd.DataFrame(records, columns=[*columns, "worse"])
+        keys = [*_PLACE, "method"]
+        some = pd.concat([at(self.cells, place) for place in self.judged])
+        some = some[(some["level"] >= LARGE) & some["method"].isin(self.rivals)]
+        lower = some["verdict"] == "lower"
+        by_value = {value: lower & (some["value"] == value) for value in ("mce", "cd")}
+        some = some.assign(**by_value, below=some["difference"] < 0)
+        levels = some.assign(worse=some["verdict"] == "higher").groupby([*keys, "level"])
+        counts = levels[["mce", "cd", "worse"]].any()
+        counts.insert(0, "both", counts["mce"] & counts["cd"])
+        counts.insert(1, "both_lower", levels["below"].sum() == 2)
+        counts = counts.groupby(level=keys).sum().reset_index()
+        means = self.by_level
+        reference = means[(means["method"] == self.reference) & (means["level"] >= LARGE)]
+        every = reference.groupby(_PLACE).size().rename("levels").reset_index()
+        counts = counts.merge(every, on=_PLACE).merge(self._below_classical(), on=keys, how="left")
+        counts.insert(3, "levels", counts.pop("levels"))
+        ordered = self._in_order(counts, "method")
+        return pd.concat([at(ordered, place) for place in self.judged], ignore_index=True)
+
+    def _below_classical(self) -> pd.DataFrame:
+        means = self.by_level[~self.by_level["partial"]]
+        keys, values = [*_PLACE, "level"], ["mce_mean", "cd_mean"]
+        best = means[means["method"].isin(self.classical)].groupby(keys)[values].min()
+        ours = means[means["method"].isin(self.candidates)]
+        both = ours.merge(best.reset_index(), on=keys, suffixes=("", "_best"))
+        found = both[[*_PLACE, "method"]].assign(classical_levels=1)
+        for value in ("mce", "cd"):
+            below = both[f"{value}_mean"] < both[f"{value}_mean_best"]
+            found[f"below_classical_{value}"] = below.astype(int)
+        return found.groupby([*_PLACE, "method"]).sum().reset_index()
 
     # ---- means
 
@@ -338,20 +264,23 @@ class Evidence:
         return self._summary(self.large_rows, True)
 
     def _summary(self, rows: pd.DataFrame, pool: bool) -> pd.DataFrame:
-        """``summary`` at every place, with ``partial``: evaluated on fewer pairs than others."""
-        table = self.at_places(statistics.summary(rows, pool_levels=pool))
-        most = table.groupby(["dataset", "backbone", "level"], dropna=False)["pairs"]
-        return table.assign(partial=table["pairs"] < most.transform("max"))
+        return self._at_places(statistics.summary(rows, pool_levels=pool))
 
-    def at_places(self, table: pd.DataFrame) -> pd.DataFrame:
-        """Rows of methods without a network, repeated for every backbone of their dataset."""
+    def _at_places(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Rows of methods without a network, repeated for every backbone of their dataset.
+
+        With ``partial``: whether others were evaluated on more pairs.
+        """
         found = []
         for place in self.places:
             own = at(table, place)
             bare = at(table, (place[0], NO_BACKBONE))
             bare = bare[~bare["method"].isin(own["method"])].assign(backbone=place[1])
             found.append(own if place[1] == NO_BACKBONE else pd.concat([own, bare]))
-        return pd.concat(found, ignore_index=True)
+        table = pd.concat(found, ignore_index=True)
+        setting = [*_PLACE, "condition", "corruption", *(["level"] if "level" in table else [])]
+        most = table.groupby(setting, dropna=False)["pairs"].transform("max")
+        return table.assign(partial=table["pairs"] < most)
 
     def ranking(
         self, methods: Sequence[str], value: str, places: Sequence[tuple[str, str]] | None = None
@@ -360,7 +289,7 @@ class Evidence:
         places = self.judged if places is None else places
         some = self.large_means
         some = some[some["method"].isin(list(methods)) & ~some["partial"]]
-        wide = some.pivot(index="method", columns=["dataset", "backbone"], values=f"{value}_mean")
+        wide = some.pivot(index="method", columns=_PLACE, values=f"{value}_mean")
         return wide.reindex(columns=list(places)).dropna().mean(axis=1).sort_values()
 
     @functools.cached_property
@@ -372,18 +301,18 @@ class Evidence:
     @functools.cached_property
     def corrupted(self) -> pd.DataFrame:
         """Means under each corruption, and on clean targets of the same pairs."""
-        keys = ["dataset", "backbone", "method", "seed", "pair"]
+        keys = [*_PLACE, "method", "seed", "pair"]
         values = ["mce", "cd"]
         rows = self.metrics[self.metrics["condition"] != CLEAN]
         both = rows.merge(self.clean[[*keys, *values]], on=keys, suffixes=("", "_clean"))
-        group = both.groupby(["dataset", "backbone", "method", "condition", "corruption"])
+        group = both.groupby([*_PLACE, "method", "condition", "corruption"])
         means = group[[*values, *(f"{v}_clean" for v in values)]].mean()
         means["pairs"] = group["pair"].nunique()
         means["levels"] = group["level"].agg(lambda x: " ".join(f"{v:g}" for v in np.unique(x)))
         means = means.reset_index()
         for value in values:
             means[f"{value}_change_percent"] = 100 * (means[value] / means[f"{value}_clean"] - 1)
-        return self.at_places(means)
+        return self._at_places(means)
 
 
 def at(table: pd.DataFrame, place: tuple[str, str]) -> pd.DataFrame:

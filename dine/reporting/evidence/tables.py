@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from dine.data.pairs import RESAMPLED
 from dine.evaluation.statistics import NO_BACKBONE
+from dine.reporting import names
+from dine.reporting.effects import verdict_cell
 from dine.reporting.evidence.comparisons import LARGE, Evidence, at
-from dine.reporting.evidence.wording import (
+from dine.reporting.names import (
     DASH,
-    HIGHER,
-    LOWER,
     MARKS,
     PARTIAL,
     VALUES,
-    capital,
-    count_of,
+    display_name,
     join,
-    minus,
     number,
     p_value,
-    percent,
+    short,
     signed,
     slug,
 )
-from dine.reporting.tables import Cell, Table, display_name, setting_text
+from dine.reporting.table import Cell, Columns, Table, laid_out
 from dine.results import CLEAN
 
-_NAMES = (("", "Kind"), ("", "Method"))
+LOWER, HIGHER = MARKS["lower"], MARKS["higher"]
+GOAL_CELLS = f"Levels with both {LOWER} / any {HIGHER}"
+Place = tuple[str, str]
+Row = Mapping[str, Any]
 _DIAGNOSED = {
     "dataset": "Dataset",
     "backbone": "Backbone",
@@ -45,111 +47,242 @@ _DIAGNOSED = {
 }
 
 
-def level_table(evidence: Evidence, place: tuple[str, str], value: str) -> Table:
-    """Means of a value by method and deformation level at a place."""
-    long, name, scale, decimals = VALUES[value]
-    column = f"{value}_mean"
-    data = pd.concat([at(evidence.by_level, place), at(evidence.pooled, place)])
-    levels = sorted(data["level"].dropna().unique())
-    here = at(evidence.comparisons, place)
-    marks = _verdicts(here[here["condition"] == CLEAN], value, "level")
-    shown = data.assign(level=data["level"].where(data["level"].notna(), "all"))
-    settings: list[Any] = [*levels, "all"]
-    can_win = shown[
-        ~shown["partial"] & shown["method"].isin([evidence.reference, *evidence.rivals])
-    ]
-    lowest = (scale * can_win.groupby("level")[column].min()).round(decimals)
-    able = set(can_win["method"])
-    extras = value == "mce"
-    rows, kinds = [], _Kinds(evidence)
-    for method in evidence.methods:
-        mine = shown[shown["method"] == method].set_index("level")
-        if mine.empty:
-            continue
-        cells = kinds.cells(method)
-        for level in settings:
-            if level not in mine.index or pd.isna(mine.loc[level, column]):
-                cells.append(Cell(DASH))
-                continue
-            mean = round(scale * mine.loc[level, column], decimals)
-            partial = bool(mine.loc[level, "partial"])
-            text = f"{mean:.{decimals}f}{PARTIAL if partial else ''}"
-            best = not partial and method in able and mean == lowest[level]
-            cells.append(Cell(text + marks.get((method, level), ""), best))
-        if extras:
-            all_ = mine.loc["all"]
-            cells += [
-                Cell(percent(all_["failure_rate"])),
-                Cell(percent(all_["folding_mean"])),
-                Cell(number(all_["roughness_mean"], 3)),
-                Cell(DASH if pd.isna(all_["seconds_mean"]) else f"{all_['seconds_mean']:.3g}"),
-            ]
-        rows.append(tuple(cells))
-    header = [*_NAMES, *(("Level", f"{level:g}") for level in levels), ("All levels", name)]
-    if extras:
-        pooled = ("Failures (%)", "Folding (%)", "Roughness", "Seconds a pair")
-        header += [("All levels", label) for label in pooled]
-    unit = " in units of 10⁻⁴" if scale != 1 else ""
+def _methods(evidence: Evidence, methods: Iterable[str]) -> Columns:
+    """The first columns: what kind of method, and which."""
+    methods = list(methods)
+    reference = {evidence.reference: " (reference)"}
+    return {
+        ("", "Kind"): [evidence.methods[name].kind for name in methods],
+        ("", "Method"): [evidence.title(name) + reference.get(name, "") for name in methods],
+    }
+
+
+def _all_data(evidence: Evidence, datasets: Iterable[str] | None = None) -> str:
+    return join([evidence.where(name) for name in datasets or evidence.datasets])
+
+
+def _short_place(place: Place) -> str:
+    return ", ".join(display_name(x) for x in place if x != NO_BACKBONE)
+
+
+def _marked(text: str, verdict: Any) -> str:
+    return f"{text} {MARKS.get(verdict, '')}".strip()
+
+
+# --------------------------------------------------------------------------------- in short
+
+
+def basis_table(evidence: Evidence) -> Table:
+    """What everything rests on: the test pairs and trainings of each dataset."""
+    networks = evidence.clean[evidence.clean["backbone"] != NO_BACKBONE]
+    seeds = networks.groupby(["dataset", "backbone", "method"])["seed"].nunique()
+    data = evidence.clean.groupby("dataset")[["pair", "object", "level"]].nunique()
+    data["fewest_seeds"] = seeds.groupby("dataset").min()
+    data["most_seeds"] = seeds.groupby("dataset").max()
+    data = data.reindex(evidence.datasets)
+    judged = dict(evidence.judged)
+    seeds = "Trainings of a network"
+    columns = {
+        ("", "Dataset"): [evidence.where(name) for name in data.index],
+        ("", "Test pairs"): data["pair"],
+        ("", "Objects"): data["object"],
+        ("", "Levels"): data["level"],
+        (seeds, "Seeds, fewest"): [number(x, 0) for x in data["fewest_seeds"]],
+        (seeds, "Seeds, most"): [number(x, 0) for x in data["most_seeds"]],
+        ("", "Counts for the goal"): ["yes" if name in judged else "no" for name in data.index],
+    }
     caption = (
-        f"{evidence.where(*place)}, clean targets. {capital(long)}{unit}, mean over "
-        f"test pairs and seeds; lower is better. Bold: lowest of the methods that register. "
-        f"{LOWER} significantly lower, {HIGHER} significantly higher than "
-        f"{evidence.title(evidence.reference)} (p < 0.05 after Holm)."
+        f"{_all_data(evidence)}. The same test pairs for all methods, averaged over seeds; "
+        "differences are between trainings of the same seeds."
     )
-    if extras:
-        true = evidence.roughness_true[place[0]]
-        caption += f" The true fields have a roughness of {true:.3f}."
-    if data["partial"].any():
-        caption += f" {PARTIAL} evaluated on some of the pairs only."
+    aside = [_short_place(place) for place in evidence.places if place not in evidence.judged]
+    if aside:
+        caption += (
+            f" {'; '.join(aside)}: shown, but with few methods or pairs, so no part of the goal "
+            "or of the order of methods."
+        )
+    title = "What this rests on"
+    return Table("basis", title, caption, **laid_out(columns), data=data.reset_index())
+
+
+def verdict_table(evidence: Evidence, place: Place) -> Table:
+    """Lower, higher or undecided: every method against the reference at a place."""
+    data = pd.concat([evidence.overall(place, condition) for condition in (CLEAN, RESAMPLED)])
+    data = data[data["method"].isin(evidence.rivals)]
+    methods = list(dict.fromkeys(data["method"]))
+    found = data.set_index(["value", "condition", "method"]).to_dict("index")
+    levels = at(evidence.cells, place).groupby(["value", "method"])["verdict"].agg(list).to_dict()
+    columns = _methods(evidence, methods)
+    for value, (long, _, _, _) in VALUES.items():
+        for condition in dict.fromkeys(data["condition"]):
+            label = "Clean targets" if condition == CLEAN else names.CONDITIONS[condition]
+            rows = [found.get((value, condition, name)) for name in methods]
+            columns[long, label] = [verdict_cell(row, "decided") for row in rows]
+        tallies = [levels.get((value, name), []) for name in methods]
+        columns[long, f"Levels {LOWER} / {HIGHER}"] = [
+            f"{x.count('lower')} / {x.count('higher')} of {len(x)}" for x in tallies
+        ]
+    reference, where = evidence.title(evidence.reference), evidence.where(*place)
     return Table(
-        name=f"{value}_{slug(*place)}",
-        title=f"{name} by level: {evidence.where(*place)}",
-        caption=caption,
-        header=tuple(header),
-        rows=tuple(rows),
+        f"verdicts_{slug(*place)}",
+        f"Lower or higher than {reference}? {where}",
+        f"{where}. Difference of the mean over all levels to {reference}, in percent of it, with "
+        f"its 95 % interval. Bold: lower. {LOWER} / {HIGHER}: levels of clean targets with a "
+        "significantly lower and higher mean.",
+        **laid_out(columns),
         data=data,
     )
 
 
-def goal_table(evidence: Evidence) -> Table:
-    """At how many large levels each method is significantly better, by place."""
+def goal_table(evidence: Evidence) -> Table | None:
+    """Whether a method is significantly better at all large levels, and which is the best."""
     goal = evidence.goal
-    places = [place for place in evidence.places if len(at(goal, place))]
-    rows, kinds = [], _Kinds(evidence)
-    needed = int(sum(at(goal, place)["levels"].max() for place in places))
-    for method in evidence.rivals:
-        mine = goal[goal["method"] == method]
-        if mine.empty:
-            continue
-        cells = [*kinds.cells(method), Cell(f"{mine['both'].sum()} of {needed}")]
-        for place in places:
-            here = at(mine, place)
-            for name in ("mce", "cd", "both", "worse"):
-                cells.append(Cell(str(here[name].iloc[0]) if len(here) else DASH))
-        rows.append(tuple(cells))
-    header = [*_NAMES, ("", "Goal cells")]
-    for place in places:
-        levels = at(goal, place)["levels"].max()
-        group = ", ".join(display_name(x) for x in place if x != NO_BACKBONE)
-        group += f": of {count_of(levels, 'level')}"
-        header += [(group, label) for label in (f"MCE {LOWER}", f"CD {LOWER}")]
-        header += [(group, f"both {LOWER}"), (group, f"any {HIGHER}")]
+    if goal.empty:
+        return None
+    methods = [evidence.reference, *evidence.rivals]
+    needed = int(goal.groupby(["dataset", "backbone"])["levels"].max().sum())
+    total = goal.groupby("method").sum(numeric_only=True).reindex(methods)
+    columns = _methods(evidence, methods)
+    for value in VALUES:
+        columns[f"Mean, levels from {LARGE:g} on", VALUES[value][0]] = _ranked(evidence, value)
+    columns["", "Reached"] = [
+        Cell(DASH if pd.isna(x) else f"{x:g} of {needed}", x == needed) for x in total["both"]
+    ]
+    columns["", "Evaluated"] = [number(x, 0) for x in total["levels"]]
+    columns["", "Both lower"] = [number(x, 0) for x in total["both_lower"]]
+    for value in VALUES:
+        below = zip(total[f"below_classical_{value}"], total["classical_levels"], strict=True)
+        columns["Below the best classical", VALUES[value][1]] = [
+            f"{x:g} of {levels:g}" if levels > 0 else DASH for x, levels in below
+        ]
+    for place in dict.fromkeys(zip(goal["dataset"], goal["backbone"], strict=True)):
+        found = at(goal, place).set_index("method").to_dict("index")
+        columns[GOAL_CELLS, _short_place(place)] = [
+            "{both} / {worse} of {levels}".format(**found[name]) if name in found else DASH
+            for name in methods
+        ]
+    reference = evidence.title(evidence.reference)
     return Table(
-        name="goal",
-        title=f"At how many levels from {LARGE:g} on is each method significantly better?",
-        caption=f"{join([evidence.where(d) for d in evidence.datasets])}, clean targets. Number of "
-        f"levels with a significantly lower ({LOWER}) mean than "
-        f"{evidence.title(evidence.reference)} by MCE, by CD and by both, and with a significantly "
-        f"higher ({HIGHER}) one by any. Goal cells: both, at all places together; the goal is all "
-        f"{needed}.",
-        header=tuple(header),
-        rows=tuple(rows),
+        "goal",
+        f"Goal: significantly better at every level from {LARGE:g} on",
+        f"{_all_data(evidence)}, clean targets. The goal: mean MCE and mean CD both significantly "
+        f"lower ({LOWER}) than those of {reference} at every level from {LARGE:g} on, on every "
+        f"dataset with every backbone, {needed} cells. Reached: cells of these; evaluated: cells "
+        "in which the method was evaluated; both lower: with both means lower, significantly or "
+        "not. Mean: over these levels, datasets and backbones, of what was evaluated everywhere; "
+        f"in brackets against {reference}; bold: the lowest. Below the best classical: levels with "
+        "a mean below that of the best classical method that was evaluated on all pairs.",
+        **laid_out(columns),
         data=goal,
     )
 
 
+def _ranked(evidence: Evidence, value: str) -> list[Cell]:
+    """The mean at large levels of the reference and every rival, with the change in percent."""
+    methods = [evidence.reference, *evidence.rivals]
+    means = evidence.ranking(methods, value)
+    _, _, scale, decimals = VALUES[value]
+    cells = []
+    for name in methods:
+        text = number(means.get(name), decimals, scale)
+        if name != evidence.reference and {name, evidence.reference} <= set(means.index):
+            change = 100 * (means[name] / means[evidence.reference] - 1)
+            text += f" ({signed(change, 1)} %)"
+        cells.append(Cell(text, name in means.index[:1]))
+    return cells
+
+
+# ------------------------------------------------------------------------------ in detail
+
+
+def mean_table(
+    evidence: Evidence, place: Place, value: str, *, corrupted: bool = False
+) -> Table | None:
+    """Means of a value by method at a place: by level, or with imperfect targets."""
+    _, name, scale, decimals = VALUES[value]
+    if corrupted:
+        data = at(evidence.corrupted, place)
+        shown = data.assign(level=np.nan, mean=data[value])
+    else:
+        data = pd.concat([at(evidence.by_level, place), at(evidence.pooled, place)])
+        shown = data.assign(mean=data[f"{value}_mean"])
+    if data.empty:
+        return None
+    keys = ["condition", "corruption", "level"]
+    marks = at(evidence.comparisons, place)
+    marks = marks.loc[marks["value"] == value, ["method", *keys, "verdict"]]
+    shown = shown.merge(marks, on=["method", *keys], how="left")
+    shown["mean"] = (scale * shown["mean"]).round(decimals)
+    can_win = shown["method"].isin([evidence.reference, *evidence.rivals]) & ~shown["partial"]
+    shown["best"] = shown["mean"].where(can_win)
+    methods = [name for name in evidence.methods if name in set(shown["method"])]
+    columns = _methods(evidence, methods)
+    for (condition, corruption, level), some in shown.groupby(keys, dropna=False):
+        some = some.assign(best=some["best"] == some["best"].min()).set_index("method")
+        rows = some.reindex(methods).to_dict("records")
+        group = "All levels" if pd.isna(level) else "Level"
+        if corrupted:
+            levels = some["levels"].iloc[0].replace(" ", ", ")
+            group = f"{names.setting_name(condition, corruption)} (level {levels})"
+        label = name if pd.isna(level) else f"{level:g}"
+        columns[group, label] = [_mean_cell(row, decimals) for row in rows]
+        if corrupted:
+            changes = [signed(row[f"{value}_change_percent"], 0) for row in rows]
+            columns[group, "% to clean"] = changes
+        elif pd.isna(level) and value == "mce":
+            columns |= _pooled(rows)
+    kind = "with imperfect targets" if corrupted else "by level"
+    return Table(
+        name=f"{'corrupted_' if corrupted else ''}{value}_{slug(*place)}",
+        title=f"{name} {kind}: {evidence.where(*place)}",
+        caption=_mean_caption(evidence, place, value, shown, corrupted),
+        **laid_out(columns),
+        data=data,
+    )
+
+
+def _mean_cell(row: Row, decimals: int) -> Cell:
+    if pd.isna(row["mean"]):
+        return Cell(DASH)
+    text = f"{row['mean']:.{decimals}f}{PARTIAL if row['partial'] else ''}"
+    return Cell(_marked(text, row["verdict"]), bool(row["best"]))
+
+
+def _pooled(rows: Sequence[Row]) -> Columns:
+    """What is known besides, over all levels."""
+    group = "All levels"
+    return {
+        (group, "Failures (%)"): [number(row["failure_rate"], 1, 100) for row in rows],
+        (group, "Folding (%)"): [number(row["folding_mean"], 1, 100) for row in rows],
+        (group, "Roughness"): [number(row["roughness_mean"], 3) for row in rows],
+        (group, "Seconds a pair"): [short(float(f"{row['seconds_mean']:.3g}")) for row in rows],
+    }
+
+
+def _mean_caption(
+    evidence: Evidence, place: Place, value: str, shown: pd.DataFrame, corrupted: bool
+) -> str:
+    where, long = evidence.where(*place), VALUES[value][0]
+    if corrupted:
+        text = (
+            f"{where}. {long} to the clean target, mean over test pairs and seeds, and its change "
+            "from the same pairs with clean targets."
+        )
+    else:
+        text = f"{where}, clean targets. {long}, mean over test pairs and seeds."
+    text += (
+        f" Lower is better. Bold: lowest of the methods that register. {LOWER} significantly "
+        f"lower, {HIGHER} significantly higher than {evidence.title(evidence.reference)} (p < 0.05 "
+        f"after Holm){' under the same corruption, levels together' if corrupted else ''}."
+    )
+    if not corrupted and value == "mce":
+        true = evidence.roughness_true[place[0]]
+        text += f" The true fields have a roughness of {true:.3f}."
+    return text + (f" {PARTIAL} on some of the pairs only." if shown["partial"].any() else "")
+
+
 def answer_table(
-    evidence: Evidence, place: tuple[str, str], value: str, *, by_level: bool = False
+    evidence: Evidence, place: Place, value: str, *, by_level: bool = False
 ) -> Table | None:
     """Every method against the reference at a place: all levels together, or each."""
     long, name, scale, decimals = VALUES[value]
@@ -157,118 +290,44 @@ def answer_table(
     data = data[data["method"].isin(evidence.rivals) & (data["value"] == value)]
     if data.empty:
         return None
-    failures = value == "mce"
-    rows, kinds = [], _Kinds(evidence)
-    for method in evidence.rivals:
-        for row in data[data["method"] == method].to_dict("records"):
-            cells = kinds.cells(method)
-            cells += [Cell(f"{row['level']:g}")] if by_level else []
-            cells += [Cell(str(row["pairs"])), *_compared(row, scale, decimals)]
-            if failures:
-                cells += [
-                    Cell(percent(row["failures_method"])),
-                    Cell(percent(row["failures_reference"])),
-                    Cell(p_value(row["p_failures"])),
-                ]
-            rows.append(tuple(cells))
-    unit = " ×10⁻⁴" if scale != 1 else ""
-    group = f"{capital(long)}{unit}"
-    labels = ("Mean", "Reference", "Difference [95 % interval]", "%", "p", "Effect", "Wins (%)")
-    header = [*_NAMES, *([("", "Level")] if by_level else []), ("", "Pairs")]
-    header += [(group, label) for label in labels]
-    if failures:
-        header += [("Failures", label) for label in ("%", "Reference %", "p")]
+    rows = data.to_dict("records")
+    columns = _methods(evidence, data["method"])
+    if by_level:
+        columns["", "Level"] = [f"{row['level']:g}" for row in rows]
+    columns["", "Pairs"] = data["pairs"]
+    for label, key in (("Mean", "mean_method"), ("Reference", "mean_reference")):
+        columns[long, label] = [number(row[key], decimals, scale) for row in rows]
+    columns[long, "Difference [95 % interval]"] = [_difference(x, decimals, scale) for x in rows]
+    columns[long, "%"] = [
+        Cell(_marked(signed(row["relative"], 1), row["verdict"]), row["verdict"] in MARKS)
+        for row in rows
+    ]
+    columns[long, "p"] = [p_value(row["p_holm"]) for row in rows]
+    columns[long, "Effect"] = [signed(row["effect"], 2) for row in rows]
+    columns[long, "Wins (%)"] = [number(row["win_rate"], 0, 100) for row in rows]
+    if value == "mce":
+        for label, key in (("%", "failures_method"), ("Reference %", "failures_reference")):
+            columns["Failures", label] = [number(row[key], 1, 100) for row in rows]
+        columns["Failures", "p"] = [p_value(row["p_failures"]) for row in rows]
     which = "each level" if by_level else "all levels together"
-    caption = (
-        f"{evidence.where(*place)}, clean targets, {which}. {capital(long)}{unit}. "
-        "Difference: method minus reference, so negative is better; interval: bootstrap over "
-        "objects; %: of the reference's mean; p: Wilcoxon"
-        + (", after Holm over the levels" if by_level else "")
-        + "; effect: rank-biserial, −1 to 1; wins: pairs on which the method is lower."
-    )
-    if failures:
-        caption += " Failures: pairs with an MCE above 0.1, p by McNemar's test."
+    where = evidence.where(*place)
     return Table(
         name=f"{'levels' if by_level else 'answer'}_{value}_{slug(*place)}",
-        title=f"{name} against {evidence.title(evidence.reference)}, {which}: "
-        f"{evidence.where(*place)}",
-        caption=caption,
-        header=tuple(header),
-        rows=tuple(rows),
+        title=f"{name} against {evidence.title(evidence.reference)}, {which}: {where}",
+        caption=f"{where}, clean targets, {which}. Difference: method minus reference, so negative "
+        "is better; interval: bootstrap over objects; %: of the reference's mean; p: Wilcoxon"
+        f"{', after Holm over the levels' if by_level else ''}; effect: rank-biserial, −1 to 1; "
+        "wins: pairs on which the method is lower."
+        + (" Failures: pairs with an MCE above 0.1, p by McNemar's test." * (value == "mce")),
+        **laid_out(columns),
         data=data,
     )
 
 
-def _compared(row: Mapping[str, Any], scale: float, decimals: int) -> list[Cell]:
-    low, high = (number(row[name], decimals, scale) for name in ("ci_low", "ci_high"))
-    interval = "" if pd.isna(row["ci_low"]) else f" [{low}, {high}]"
-    mark = MARKS[row["verdict"]]
-    return [
-        Cell(number(row["mean_method"], decimals, scale)),
-        Cell(number(row["mean_reference"], decimals, scale)),
-        Cell(number(row["difference"], decimals, scale) + interval),
-        Cell(signed(row["relative"], 1) + mark, bool(mark)),
-        Cell(p_value(row["p_holm"])),
-        Cell(signed(row["effect"], 2)),
-        Cell(number(row["win_rate"], 0, 100)),
-    ]
-
-
-def corruption_table(evidence: Evidence, place: tuple[str, str], value: str) -> Table | None:
-    """Means under noise, outliers and on resampled targets, and the change from clean ones."""
-    data = at(evidence.corrupted, place)
-    if data.empty:
-        return None
-    long, name, scale, decimals = VALUES[value]
-    order = {"deformation": 0, "noise": 1, "outliers": 2, "resampled": 3}
-    settings = sorted(
-        set(zip(data["condition"], data["corruption"], strict=True)),
-        key=lambda setting: (order[setting[0]], setting[1]),
-    )
-    here = at(evidence.comparisons, place)
-    corrupted = here[(here["condition"] != CLEAN) & here["level"].isna()]
-    marks = _verdicts(corrupted, value, "condition", "corruption")
-    lowest = {}
-    able = {evidence.reference, *evidence.rivals}
-    for key, some in data[data["method"].isin(able)].groupby(["condition", "corruption"]):
-        full = some[some["pairs"] == some["pairs"].max()]
-        lowest[key] = round(scale * full[value].min(), decimals)
-    rows, kinds = [], _Kinds(evidence)
-    for method in evidence.methods:
-        mine = data[data["method"] == method].set_index(["condition", "corruption"])
-        if mine.empty:
-            continue
-        cells = kinds.cells(method)
-        for setting in settings:
-            if setting not in mine.index or pd.isna(mine.loc[setting, value]):
-                cells += [Cell(DASH)] * 2
-                continue
-            row = mine.loc[setting]
-            mean = round(scale * row[value], decimals)
-            bold = mean == lowest.get(setting) and method in able
-            text = f"{mean:.{decimals}f}{marks.get((method, *setting), '')}"
-            cells += [Cell(text, bold), Cell(signed(row[f"{value}_change_percent"], 0))]
-        rows.append(tuple(cells))
-    header = list(_NAMES)
-    for setting in settings:
-        levels = data.loc[
-            (data["condition"] == setting[0]) & (data["corruption"] == setting[1]), "levels"
-        ].iloc[0]
-        group = f"{setting_text(*setting)} (level {levels.replace(' ', ', ')})"
-        header += [(group, name), (group, "% to clean")]
-    unit = " in units of 10⁻⁴" if scale != 1 else ""
-    return Table(
-        name=f"corrupted_{value}_{slug(*place)}",
-        title=f"{name} with imperfect targets: {evidence.where(*place)}",
-        caption=f"{evidence.where(*place)}. {capital(long)}{unit} to the clean target, "
-        "mean over test pairs and seeds, and its change from the same pairs with clean targets. "
-        f"{LOWER} and {HIGHER}: significantly lower and higher than "
-        f"{evidence.title(evidence.reference)} under the same corruption, all these levels "
-        "together. Bold: lowest of the methods that register.",
-        header=tuple(header),
-        rows=tuple(rows),
-        data=data,
-    )
+def _difference(row: Row, decimals: int, scale: float) -> str:
+    text = number(row["difference"], decimals, scale)
+    ends = [number(row[name], decimals, scale) for name in ("ci_low", "ci_high")]
+    return text if pd.isna(row["ci_low"]) else f"{text} [{', '.join(ends)}]"
 
 
 def seed_table(evidence: Evidence) -> Table | None:
@@ -276,99 +335,52 @@ def seed_table(evidence: Evidence) -> Table | None:
     data = evidence.pooled[evidence.pooled["seeds"] > 1]
     if data.empty:
         return None
-    rows = []
-    for place in evidence.places:
-        here = at(data, place).set_index("method")
-        compared = evidence.overall(place).set_index(["method", "value"])["difference"]
-        for method in [name for name in evidence.methods if name in here.index]:
-            row = here.loc[method]
-            cells = [*map(display_name, place), evidence.title(method), f"{row['seeds']:g}"]
-            for value, (_, _, scale, decimals) in VALUES.items():
-                seeds, pairs = row[f"{value}_seed_sd"], row[f"{value}_sd"]
-                cells += [
-                    number(row[f"{value}_mean"], decimals, scale),
-                    number(seeds, decimals, scale),
-                    number(pairs, decimals, scale),
-                    number(compared.get((method, value), np.nan), decimals, scale),
-                ]
-            rows.append(tuple(Cell(text) for text in cells))
-    labels = ("Mean", "sd over seeds", "sd over pairs", "minus reference")
-    groups = ("Mean correspondence error", "Chamfer distance ×10⁻⁴")
-    header = [("", label) for label in ("Dataset", "Backbone", "Method", "Seeds")]
-    header += [(group, label) for group in groups for label in labels]
-    shown = [d for d in evidence.datasets if (data["dataset"] == d).any()]
+    labels = {"mean": "Mean", "seed_sd": "sd over seeds", "sd": "sd over pairs"}
+    columns: Columns = {
+        ("", "Dataset"): data["dataset"].map(display_name),
+        ("", "Backbone"): data["backbone"].map(display_name),
+        ("", "Method"): data["method"].map(evidence.title),
+        ("", "Seeds"): data["seeds"],
+    }
+    for value, (long, _, scale, decimals) in VALUES.items():
+        for name, label in labels.items():
+            column = data[f"{value}_{name}"]
+            columns[long, label] = [number(x, decimals, scale) for x in column]
     return Table(
         name="seeds",
         title="Spread over seeds and over pairs",
-        caption=f"{join([evidence.where(d) for d in shown])}, clean targets, all levels together. "
-        "Sd over seeds: standard deviation of the means of the trainings; sd over pairs: of the "
-        "pairs, averaged over seeds. A difference from the reference no larger than the sd over "
-        "seeds may be luck of the training.",
-        header=tuple(header),
-        rows=tuple(rows),
+        caption=f"{_all_data(evidence, dict.fromkeys(data['dataset']))}, clean targets, all levels "
+        "together. Sd over seeds: standard deviation of the means of the trainings; sd over pairs: "
+        "of the pairs, averaged over seeds. A difference from the reference no larger than the sd "
+        "over seeds may be luck of the training.",
+        **laid_out(columns),
         data=data,
     )
 
 
-def diagnostics_table(evidence: Evidence, found: Sequence[Mapping[str, Any]]) -> Table | None:
+def diagnostics_table(evidence: Evidence, found: Sequence[Row]) -> Table | None:
     """What ``diagnose`` found about each prior on fields that were not used for the fit."""
     if not found:
         return None
     data = pd.DataFrame(found)
     # A mapping or a list inside would not be a cell.
     data = data[[c for c in data if not data[c].map(lambda x: isinstance(x, dict | list)).any()]]
-    columns = [*(c for c in _DIAGNOSED if c in data), *(c for c in data if c not in _DIAGNOSED)]
-    rows = []
-    for record in data[columns].to_dict("records"):
-        rows.append(tuple(Cell(diagnosed(evidence, *entry)) for entry in record.items()))
+    data = data[[*(c for c in _DIAGNOSED if c in data), *(c for c in data if c not in _DIAGNOSED)]]
+    titles = {name: method.title for name, method in evidence.methods.items()}
+    priors = data["prior"].map(lambda name: titles.get(name, name))
+    columns = {
+        ("", _DIAGNOSED.get(name, name)): priors if name == "prior" else data[name] for name in data
+    }
+    columns = {key: [short(value) for value in column] for key, column in columns.items()}
     return Table(
         name="diagnostics",
         title="What the priors know",
-        caption=f"{join(_places_named(evidence, data))}. Measured on fields that were not used for "
-        "the fit, normalised frame. −log p: negative log-likelihood, lower is better; only values "
-        "per coordinate compare between priors. Generalisation: how far the prior's closest field "
-        "is from a new one, lower is better. Specificity: how far samples are from the nearest "
-        "training field; low is realistic, but a prior that repeats what it saw has 0.",
-        header=tuple(("", _DIAGNOSED.get(name, name)) for name in columns),
-        rows=tuple(rows),
-        data=data[columns],
+        caption=f"{_all_data(evidence, dict.fromkeys(data['dataset']))}. Measured on fields that "
+        "were not used for the fit, normalised frame. −log p: negative log-likelihood, lower is "
+        "better; only values per coordinate compare between priors. Generalisation: how far the "
+        "prior's closest field is from a new one, lower is better. Specificity: how far samples "
+        "are from the nearest training field; low is realistic, but a prior that repeats what it "
+        "saw has 0.",
+        **laid_out(columns),
+        data=data,
     )
-
-
-def diagnosed(evidence: Evidence, name: str, value: Any) -> str:
-    if name == "prior":
-        return evidence.title(value) if value in evidence.methods else display_name(value)
-    if isinstance(value, str):
-        return display_name(value)
-    if value is None or pd.isna(value):
-        return DASH
-    return minus(f"{value:.4g}")
-
-
-def _places_named(evidence: Evidence, data: pd.DataFrame) -> list[str]:
-    return [evidence.where(d) for d in dict.fromkeys(data["dataset"])]
-
-
-def _verdicts(comparisons: pd.DataFrame, value: str, *keys: str) -> dict[tuple, str]:
-    """The mark of each method and setting; those of all levels have no level."""
-    found = {}
-    for row in comparisons[comparisons["value"] == value].to_dict("records"):
-        setting = ("all" if pd.isna(row[key]) else row[key] for key in keys)
-        found[row["method"], *setting] = MARKS[row["verdict"]]
-    return found
-
-
-class _Kinds:
-    """First column of a table: the heading of a group, only where it begins."""
-
-    def __init__(self, evidence: Evidence):
-        self.evidence = evidence
-        self.last = ""
-
-    def cells(self, method: str) -> list[Cell]:
-        kind = self.evidence.methods[method].kind
-        first, self.last = kind != self.last, kind
-        name = self.evidence.title(method)
-        if method == self.evidence.reference:
-            name += " (reference)"
-        return [Cell(kind if first else ""), Cell(name)]

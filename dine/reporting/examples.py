@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from dine.errors import DataError
 from dine.evaluation.conditions import Condition, evaluation_conditions
 from dine.evaluation.predictions import Prediction, read_predictions
 from dine.reporting.figures import Example, qualitative_figure, save_figure
-from dine.reporting.tables import display_name, setting_text
+from dine.reporting.names import display_name, setting_name
 from dine.results import CLEAN
 
 
@@ -54,43 +53,34 @@ def draw_examples(
                 )
             fields[name] = mine[0]
         examples.append(typical(condition, fields))
-    origin = str(condition.pairs.attributes.get("origin", "synthetic"))
     named = {name: titles.get(name, name) for name in predictions}
-    save_figure(_figure(examples, named, dataset, origin), out.with_suffix(""))
+    figure = qualitative_figure(
+        examples,
+        f"{display_name(dataset)}: typical pairs",
+        str(condition.pairs.attributes.get("origin", "synthetic")),
+        titles=named,
+        error="Distance from the true place (object radii)",
+        note=f"Grey: target. The median case of {next(iter(named.values()))} in each row.",
+    )
+    save_figure(figure, out.with_suffix(""))
 
 
 def typical(condition: Condition, fields: Mapping[str, Prediction]) -> Example:
     """The pair with the median error of the first method, with what all of them made of it."""
     pairs = condition.pairs
-    first = next(iter(fields.values()))
     truth = pairs.target - pairs.source
-    errors = np.linalg.norm(first.displacement - truth, axis=2).mean(axis=1)
+    errors = {n: np.linalg.norm(p.displacement - truth, axis=2) for n, p in fields.items()}
     rows = np.arange(len(pairs))
     if condition.name == CLEAN:
         rows = np.flatnonzero(pairs.level == pairs.level.max())
-    row = rows[np.argsort(errors[rows], kind="stable")[(len(rows) - 1) // 2]]
-    label = f"{setting_text(condition.name, condition.corruption)}\nlevel {pairs.level[row]:g}"
+    mean = errors[next(iter(fields))].mean(axis=1)
+    row = rows[np.argsort(mean[rows], kind="stable")[(len(rows) - 1) // 2]]
+    label = f"{setting_name(condition.name, condition.corruption)}\nlevel {pairs.level[row]:g}"
     return Example(
         label,
         pairs.source[row],
         pairs.target[row],
         {name: pairs.source[row] + p.displacement[row] for name, p in fields.items()},
-        {
-            name: np.linalg.norm(p.displacement[row] - truth[row], axis=1)
-            for name, p in fields.items()
-        },
+        {name: values[row] for name, values in errors.items()},
         None if condition.name == CLEAN else condition.targets[row],
-    )
-
-
-def _figure(
-    examples: list[Example], titles: Mapping[str, str], dataset: str, origin: str
-) -> Figure:
-    return qualitative_figure(
-        examples,
-        f"{display_name(dataset)}: typical pairs",
-        origin,
-        titles=titles,
-        error="Distance from the true place (object radii)",
-        note=f"Grey: target. The median case of {next(iter(titles.values()))} in each row.",
     )
