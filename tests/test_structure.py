@@ -22,7 +22,8 @@ FLOORS = [
     ("models",),
     ("priors",),
     ("refinement",),
-    ("evaluation", "training"),
+    ("training",),
+    ("evaluation",),
     ("viewer",),
     ("classical", "registration"),
     ("reporting",),
@@ -60,6 +61,16 @@ def modules():
 def test_nothing_imports_upwards(name, path):
     own = floor_of(name)
     assert not {other for other in imported(path) if floor_of(other) > own}
+
+
+def test_contributing_lists_the_packages_from_the_ground_up():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    listed = re.findall(r"^\| `dine\.(\w+)` \|", text, re.MULTILINE)
+    packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").exists()}
+    assert set(listed) == packages
+    assert [floor_of(f"dine.{name}") for name in listed] == sorted(
+        floor_of(f"dine.{name}") for name in listed
+    )
 
 
 @pytest.mark.parametrize("path", RULES, ids=lambda path: path.name)
