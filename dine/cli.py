@@ -769,6 +769,26 @@ def evidence(metrics, methods, reference, searches, diagnostics, examples, setti
 # --- own scans ------------------------------------------------------------------------------------
 
 
+@cli.command()
+@click.argument("folder", type=FOLDER, default=".")
+def scans(folder: Path):
+    """Write before.ply and after.ply, two small synthetic scans of one organ, to try things with.
+
+    Example: dine scans trial
+    """
+    from importlib import resources
+
+    from dine.files import atomic_path
+
+    for name in ("before.ply", "after.ply"):
+        if (folder / name).exists():
+            raise DataError(f"{folder / name} is there already; name another folder.")
+    for name in ("before.ply", "after.ply"):
+        with atomic_path(folder / name) as temporary:
+            temporary.write_bytes((resources.files("dine") / "scans" / name).read_bytes())
+    click.echo(f"{folder / 'before.ply'}, {folder / 'after.ply'}")
+
+
 def model_options(command):
     """Which weights to register with; given to the command as ``model``."""
 

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from dine import cli
+from dine.io.readers import read_surface
 
 CONFIG = Path(__file__).resolve().parents[1] / "config.yaml"
 
@@ -52,3 +54,13 @@ def test_every_command_shows_an_example_that_parses(path, command, tmp_path, mon
         assert tuple(words[: len(path)]) == path
         cli.cli.main(words, prog_name="dine", standalone_mode=False)
     assert len(called) == len(shown)
+
+
+def test_scans_to_try_things_with(tmp_path):
+    done = CliRunner().invoke(cli.cli, ["scans", str(tmp_path / "trial")])
+    assert done.exit_code == 0
+    before, after = (read_surface(tmp_path / "trial" / f"{x}.ply") for x in ("before", "after"))
+    assert len(before.faces) > len(after.faces) > 1000
+    # They are not written over.
+    again = CliRunner().invoke(cli.cli, ["scans", str(tmp_path / "trial")])
+    assert "is there already" in str(again.exception)
