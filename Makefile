@@ -7,7 +7,9 @@ INPUTS ?= 12000
 SEED ?= 0
 BIN := .venv/bin
 
-.PHONY: run tiny test test-cpus kill-test fuzz test-oldest check format docs wheel-check slurm-test profiles-check audit lock
+.PHONY: install run tiny test test-cpus kill-test fuzz test-oldest check format docs wheel-check slurm-test profiles-check audit lock
+
+install: .venv/installed
 
 run: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all
