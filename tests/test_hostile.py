@@ -564,9 +564,12 @@ def test_messages_on_settings_stay_short():
 def test_taking_entries_away_from_an_evidence_that_holds_lists():
     values = config.read_yaml("config.yaml")
     values["priors"] = {**values["priors"], "pca": None}
-    values["evidence"]["methods"] = {"x": {"prior": ["pca"], "priors": [["pca"], {}]}}
-    values["evidence"]["examples"] = [["pca"], {}, "lambda0"]
-    values["evidence"]["test_sets"] = {"mine": {"folder": "x", "networks": ["synbench"]}}
+    values["evidence"] = {
+        "methods": {"x": {"prior": ["pca"], "priors": [["pca"], {}]}},
+        "only": ["x"],
+        "examples": [["pca"], {}, "lambda0"],
+        "test_sets": {"mine": {"folder": "x", "networks": ["synbench"]}},
+    }
     with pytest.raises(ConfigError, match="examples"):
         config.validate(values)
 

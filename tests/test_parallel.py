@@ -9,13 +9,12 @@ import time
 import numpy as np
 import pytest
 import torch
-from test_training import IDENTITY, SETTINGS, Exploding, toy_pairs
+from test_training import IDENTITY, SETTINGS, Exploding, job, toy_pairs
 
 from dine.errors import ConfigError, DineError
 from dine.models.backbones import Backbone, Registration
 from dine.models.state import Interrupted, load_state, one_writer
 from dine.training import loop, parallel
-from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective
 
 pytestmark = pytest.mark.numerical
@@ -43,14 +42,9 @@ def run(folder, processes, *, steps=8, objective=None, on_step=None, batch_size=
     backbone = Mover()
     history = loop.train(
         backbone,
-        objective or Objective(DATA_TERMS.get("chamfer")()),
-        toy_pairs(),
-        toy_pairs(3, seed=1),
-        SETTINGS.model_copy(update=changes),
-        seed=7,
-        folder=folder,
-        identity=IDENTITY,
-        name="toy",
+        job(folder, objective, SETTINGS.model_copy(update=changes), 7),
+        loop.Seen(toy_pairs()),
+        loop.Seen(toy_pairs(3, seed=1)),
         device="cpu",
         processes=processes,
         on_step=on_step,

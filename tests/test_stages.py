@@ -285,7 +285,7 @@ def test_results_that_are_no_longer_asked_for_are_not_written(chain, tmp_path, m
     def disturbed(*arguments, **keywords):
         history = train(*arguments, **keywords)
         monkeypatch.setattr(stages, "train", train)
-        with one_writer(keywords["folder"], {}), pytest.raises(DineError, match="is in use by"):
+        with one_writer(arguments[1].folder, {}), pytest.raises(DineError, match="is in use by"):
             dine(*command, json.dumps(json.loads(STAGE1) | {"steps": 4}))
         return history
 

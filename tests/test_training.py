@@ -47,20 +47,20 @@ def toy_pairs(count=5, points=40, seed=0):
     return PairSet(source=source, target=target, **columns, attributes={})
 
 
+def job(folder, objective=None, settings=SETTINGS, seed=0, identity=IDENTITY):
+    objective = objective or Objective(DATA_TERMS.get("chamfer")())
+    return loop.Job(objective, settings, seed, folder, identity, "toy")
+
+
 def run(folder, *, steps=6, identity=IDENTITY, on_step=None, objective=None, settings=SETTINGS):
     # PyTorch's own initial weights leave something to learn even on toy pairs.
     arguments = {"candidates": 16, "initialisation": "default"}
     backbone = new_backbone("robust_defreg", arguments, seed=0)
     history = loop.train(
         backbone,
-        objective or Objective(DATA_TERMS.get("chamfer")()),
-        toy_pairs(),
-        toy_pairs(3, seed=1),
-        settings.model_copy(update={"steps": steps}),
-        seed=7,
-        folder=folder,
-        identity=identity,
-        name="toy",
+        job(folder, objective, settings.model_copy(update={"steps": steps}), 7, identity),
+        loop.Seen(toy_pairs()),
+        loop.Seen(toy_pairs(3, seed=1)),
         device="cpu",
         on_step=on_step,
     )
@@ -125,14 +125,9 @@ def test_a_backbone_that_draws_random_numbers_is_resumed_bit_for_bit(tmp_path):
         backbone = Noisy()
         loop.train(
             backbone,
-            Objective(DATA_TERMS.get("chamfer")()),
-            toy_pairs(),
-            toy_pairs(1),
-            SETTINGS,
-            seed=0,
-            folder=folder,
-            identity=IDENTITY,
-            name="toy",
+            job(folder),
+            loop.Seen(toy_pairs()),
+            loop.Seen(toy_pairs(1)),
             device="cpu",
             on_step=kill,
         )
@@ -213,16 +208,12 @@ def test_a_second_writer_is_refused(tmp_path):
 
 def test_training_lowers_the_loss(tmp_path):
     pairs = toy_pairs()
+    changes = {"steps": 60, "learning_rate": 1e-2}
     history = loop.train(
         Shift(),
-        Objective(DATA_TERMS.get("l1")()),
-        dataclasses.replace(pairs, target=pairs.source + np.float32([0.2, -0.1, 0.3])),
-        toy_pairs(1),
-        SETTINGS.model_copy(update={"steps": 60, "learning_rate": 1e-2}),
-        seed=0,
-        folder=tmp_path,
-        identity=IDENTITY,
-        name="toy",
+        job(tmp_path, Objective(DATA_TERMS.get("l1")()), SETTINGS.model_copy(update=changes)),
+        loop.Seen(dataclasses.replace(pairs, target=pairs.source + np.float32([0.2, -0.1, 0.3]))),
+        loop.Seen(toy_pairs(1)),
         device="cpu",
     )
     assert history[-1]["loss"] < 0.1 * history[0]["loss"]
@@ -254,14 +245,9 @@ def test_empty_splits_are_refused(tmp_path):
     with pytest.raises(DataError, match="no validation pairs"):
         loop.train(
             new_backbone("robust_defreg", {}, seed=0),
-            Objective(DATA_TERMS.get("chamfer")()),
-            toy_pairs(),
-            empty,
-            SETTINGS,
-            seed=0,
-            folder=tmp_path,
-            identity=IDENTITY,
-            name="toy",
+            job(tmp_path),
+            loop.Seen(toy_pairs()),
+            loop.Seen(empty),
         )
 
 

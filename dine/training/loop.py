@@ -14,13 +14,16 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from dine.config import Training, check_shares
+from dine.data.batch import Batch
 from dine.data.loading import Batches, Request
 from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
@@ -110,37 +113,60 @@ def history_csv(history: list[dict[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def train(
-    backbone: Backbone,
-    objective: Objective,
-    train_pairs: PairSet,
-    val_pairs: PairSet,
-    settings: Training,
-    *,
-    seed: int,
-    folder: Path,
-    identity: dict[str, str],
-    name: str,
-    train_targets: np.ndarray | None = None,
-    val_targets: np.ndarray | None = None,
-    device: str = "auto",
-    processes: int = 1,
-    on_step: Callable[[int], None] | None = None,
-) -> list[dict[str, Any]]:
-    """Train in place, resuming from ``folder`` when its state has the same ``identity``.
+@dataclass(frozen=True)
+class Seen:
+    """Pairs, and targets (P, M, 3) that stand in for their own, if there are any."""
 
-    Args:
-        backbone: trained in place; its initial weights are part of the identity.
+    pairs: PairSet
+    targets: np.ndarray | None = None
+
+    def batches(self, device: torch.device, parts: float = 0.0) -> Batches:
+        """For training or validation; see :class:`~dine.data.loading.Batches`."""
+        return Batches(self.pairs, device, self.targets, parts)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One training, apart from the network and the pairs.
+
+    Attributes:
         objective: what is minimised.
-        train_pairs: cycled through in an order drawn from the seed.
-        val_pairs: measured every ``settings.validate_every`` steps; never trained on.
         settings: steps, rates and the rest.
         seed: of the order of pairs and of the targets' points.
         folder: where state and running history are kept.
         identity: digests that a saved state must share to be used (settings, inputs, code).
         name: shown with the progress.
-        train_targets: (P, M, 3), stand in for the training pairs' own targets.
-        val_targets: likewise for the validation pairs.
+    """
+
+    objective: Objective
+    settings: Training
+    seed: int
+    folder: Path
+    identity: dict[str, str]
+    name: str
+
+    @property
+    def state(self) -> Path:
+        return self.folder / STATE
+
+
+def train(
+    backbone: Backbone,
+    job: Job,
+    seen: Seen,
+    validated: Seen,
+    *,
+    device: str = "auto",
+    processes: int = 1,
+    on_step: Callable[[int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Train in place, resuming from the job's folder when its state has the same identity.
+
+    Args:
+        backbone: trained in place; its initial weights are part of the identity.
+        job: what to minimise, how, and where the state is kept.
+        seen: pairs that are trained on, cycled through in an order drawn from the seed.
+        validated: measured every ``validate_every`` steps; never trained on.
         device: ``auto``, ``cpu`` or ``cuda``.
         processes: that share every batch, on all nodes together; on CUDA each has a device of its
             own. Their number changes the result by rounding only, and is no part of the identity.
@@ -155,34 +181,22 @@ def train(
         ConfigError: the processes cannot share a batch equally.
         DineError: the folder is in use, a process died, or the loss stopped being finite.
     """
-    for split, pairs in (("train", train_pairs), ("validation", val_pairs)):
-        if len(pairs) == 0:
+    for split, some in (("train", seen), ("validation", validated)):
+        if len(some.pairs) == 0:
             raise DataError(f"There are no {split} pairs; the dataset has too few base objects.")
     try:
-        check_shares(settings.batch_size, processes)
+        check_shares(job.settings.batch_size, processes)
     except ValueError as error:
         raise ConfigError(f"{error}.") from None
     work = functools.partial(
-        _train,
-        backbone=backbone,
-        objective=objective,
-        train_pairs=train_pairs,
-        val_pairs=val_pairs,
-        train_targets=train_targets,
-        val_targets=val_targets,
-        settings=settings,
-        seed=seed,
-        folder=folder,
-        identity=identity,
-        name=name,
-        on_step=on_step,
+        _train, backbone=backbone, job=job, seen=seen, validated=validated, on_step=on_step
     )
     chosen = chosen_device(device)
     if processes == 1:
         with leased(chosen) as devices, StopRequest() as stop:
             return work(Alone(devices[0], stop))
     run_together(processes, chosen, work)
-    state, _ = load_state(folder / STATE, identity)
+    state, _ = load_state(job.state, job.identity)
     backbone.load_state_dict(state["model"])
     return state["history"]
 
@@ -191,109 +205,123 @@ def _train(
     team: Team,
     *,
     backbone: Backbone,
-    objective: Objective,
-    train_pairs: PairSet,
-    val_pairs: PairSet,
-    train_targets: np.ndarray | None,
-    val_targets: np.ndarray | None,
-    settings: Training,
-    seed: int,
-    folder: Path,
-    identity: dict[str, str],
-    name: str,
+    job: Job,
+    seen: Seen,
+    validated: Seen,
     on_step: Callable[[int], None] | None,
 ) -> list[dict[str, Any]]:
     """One process's part of :func:`train`."""
-    backbone.to(team.device).train()
-    if objective.prior is not None:
-        objective.prior.to(team.device)
-    optimiser = torch.optim.AdamW(
-        backbone.parameters(),
-        lr=settings.learning_rate,
-        weight_decay=settings.weight_decay,
-        fused=True,
-    )
-    batches = Batches(train_pairs, team.device, train_targets, settings.parts)
-    val_batches = Batches(val_pairs, team.device, val_targets)
-    path = folder / STATE
-    with one_writer(folder, identity) if team.leads else contextlib.nullcontext():
+    with one_writer(job.folder, job.identity) if team.leads else contextlib.nullcontext():
         team.wait()  # until the folder is ours
-        state, message = load_state(path, identity)
-        log.info("%s: %s", name, message)
-        start, history = 0, []
-        if state is not None:
-            backbone.load_state_dict(state["model"])
-            optimiser.load_state_dict(state["optimiser"])
-            start, history = state["step"], state["history"]
-        loss_of = team.share(Loss(backbone, objective))
+        trainer = _Trainer(team, backbone, job)
+        start = trainer.resume()
+        trainer.take_steps(start, seen, validated.batches(team.device), on_step)
+    team.wait()  # until the last state is saved, which other nodes read
+    return trainer.history
 
-        def save(step: int) -> None:
-            save_state(
-                path,
-                {
-                    "identity": identity,
-                    "step": step,
-                    "model": backbone.state_dict(),
-                    "optimiser": optimiser.state_dict(),
-                    "history": history,
-                },
-            )
-            write_text(Network(folder).history, history_csv(history))
 
-        saved = time.monotonic()
-        elapsed = history[-1]["seconds"] if history else 0.0
-        began = time.monotonic() - elapsed
+class _Trainer:
+    """One process's network and optimiser, and what was measured so far."""
+
+    def __init__(self, team: Team, backbone: Backbone, job: Job):
+        self.team, self.backbone, self.job = team, backbone, job
+        self.history: list[dict[str, Any]] = []
+        backbone.to(team.device).train()
+        if job.objective.prior is not None:
+            job.objective.prior.to(team.device)
+        self.optimiser = torch.optim.AdamW(
+            backbone.parameters(),
+            lr=job.settings.learning_rate,
+            weight_decay=job.settings.weight_decay,
+            fused=True,
+        )
+
+    def resume(self) -> int:
+        """Take over a saved state, if there is one of this job; steps that are done."""
+        state, message = load_state(self.job.state, self.job.identity)
+        log.info("%s: %s", self.job.name, message)
+        if state is None:
+            return 0
+        self.backbone.load_state_dict(state["model"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.history = state["history"]
+        return state["step"]
+
+    def save(self, step: int) -> None:
+        """State and history after so many steps."""
+        save_state(
+            self.job.state,
+            {
+                "identity": self.job.identity,
+                "step": step,
+                "model": self.backbone.state_dict(),
+                "optimiser": self.optimiser.state_dict(),
+                "history": self.history,
+            },
+        )
+        write_text(Network(self.job.folder).history, history_csv(self.history))
+
+    def take_steps(
+        self, start: int, seen: Seen, validated: Batches, on_step: Callable[[int], None] | None
+    ) -> None:
+        """All steps from ``start`` on; see :func:`train`."""
+        team, job, settings = self.team, self.job, self.job.settings
+        batches = seen.batches(team.device, settings.parts)
+        loss_of = team.share(Loss(self.backbone, job.objective))
         steps = range(start, settings.steps)
         stream = batches.stream(
-            share_of(team, step, settings.batch_size, len(batches), seed) for step in steps
+            share_of(team, step, settings.batch_size, len(batches), job.seed) for step in steps
         )
+        saved = time.monotonic()
+        began = saved - (self.history[-1]["seconds"] if self.history else 0.0)
         with (
             torch.random.fork_rng(devices=[]),
             contextlib.closing(stream),
-            Progress(name, settings.steps, start, quiet=not team.leads) as progress,
+            Progress(job.name, settings.steps, start, quiet=not team.leads) as progress,
         ):
             for step, (batch, truth) in zip(steps, stream, strict=True):
-                seed_torch(seed, step, team.rank)
-                rate = learning_rate(settings, step)
-                for group in optimiser.param_groups:
-                    group["lr"] = rate
-                loss, data, penalty = loss_of(batch, truth)
-                optimiser.zero_grad(set_to_none=True)
-                loss.backward()
-                norm = torch.nn.utils.clip_grad_norm_(backbone.parameters(), settings.clip)
-                # All numbers in one transfer: on a GPU each of its own would stall the step.
-                values = team.mean(torch.stack([loss.detach(), data, penalty, norm]))
-                measured = dict(zip(MEASURED, values, strict=True))
-                if not all(map(math.isfinite, values)):
-                    raise DineError(
-                        f"{name} diverged at step {step}: loss {measured['loss']}, gradient norm "
-                        f"{measured['grad_norm']}; lower learning_rate or the prior's weight."
-                    )
-                optimiser.step()
-                row = {
-                    "step": step + 1,
-                    **measured,
-                    "learning_rate": rate,
-                    "seconds": time.monotonic() - began,
-                }
-                history.append(row)
+                row = self._step(step, loss_of, batch, truth)
+                row["seconds"] = time.monotonic() - began
+                self.history.append(row)
                 last = step + 1 == settings.steps
                 if team.leads:
                     if last or (step + 1) % settings.validate_every == 0:
-                        row |= validate(backbone, val_batches, settings.validation_pairs)
-                    progress.update(1, loss=np.mean([r["loss"] for r in history[-50:]]))
+                        row |= validate(self.backbone, validated, settings.validation_pairs)
+                    progress.update(1, loss=np.mean([r["loss"] for r in self.history[-50:]]))
                     if on_step is not None:
                         on_step(step)
                 stopping = team.stopping
                 late = time.monotonic() - saved > settings.save_seconds
                 if team.leads and (last or late or stopping):
-                    save(step + 1)
+                    self.save(step + 1)
                     saved = time.monotonic()
                 if stopping and not last:
                     team.wait()  # until the state is saved
                     raise Interrupted(
-                        f"{name} was stopped after step {step + 1} of {settings.steps}; run the "
-                        "same command again to go on from there."
+                        f"{job.name} was stopped after step {step + 1} of {settings.steps}; run "
+                        "the same command again to go on from there."
                     )
-    team.wait()  # until the last state is saved, which other nodes read
-    return history
+
+    def _step(
+        self, step: int, loss_of: Callable[..., tuple[Tensor, ...]], batch: Batch, truth: Tensor
+    ) -> dict[str, Any]:
+        """One step of the optimiser, and its row of the history but for the time."""
+        job = self.job
+        seed_torch(job.seed, step, self.team.rank)
+        rate = learning_rate(job.settings, step)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        loss, data, penalty = loss_of(batch, truth)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.backbone.parameters(), job.settings.clip)
+        # All numbers in one transfer: on a GPU each of its own would stall the step.
+        values = self.team.mean(torch.stack([loss.detach(), data, penalty, norm]))
+        measured = dict(zip(MEASURED, values, strict=True))
+        if not all(map(math.isfinite, values)):
+            raise DineError(
+                f"{job.name} diverged at step {step}: loss {measured['loss']}, gradient norm "
+                f"{measured['grad_norm']}; lower learning_rate or the prior's weight."
+            )
+        self.optimiser.step()
+        return {"step": step + 1, **measured, "learning_rate": rate}

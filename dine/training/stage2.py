@@ -16,7 +16,7 @@ from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import VALIDATION_COLUMNS
 from dine.training.objective import Objective
-from dine.training.stages import run
+from dine.training.stages import Order, run
 
 
 def selected_lambda(path: Path, prior: str) -> float:
@@ -56,24 +56,20 @@ def stage2(
     if variant == CONTROL and prior is not None:
         raise ConfigError(f"The variant {variant!r} takes no prior.")
     backbone, facts = load_backbone(model)
+    penalised = load_prior(prior) if prior else None
+    described = {"stage": 2, "variant": variant, "lambda": weight, "backbone": facts["backbone"]}
+    inputs = {
+        "model": file_digest(model),
+        "prior": file_digest(prior) if prior else None,
+        "lambda": weight,
+    }
     run(
         backbone,
-        Objective(
-            DATA_TERMS.get(settings.data_term)(), load_prior(prior) if prior else None, weight
-        ),
-        [pairs],
+        Objective(DATA_TERMS.get(settings.data_term)(), penalised, weight),
         settings,
-        step="stage2",
-        seed=seed,
-        out=out,
-        name=name,
-        compute=compute,
-        inputs={
-            "model": file_digest(model),
-            "prior": file_digest(prior) if prior else None,
-            "lambda": weight,
-        },
-        facts={"stage": 2, "variant": variant, "lambda": weight, "backbone": facts["backbone"]},
+        Order("stage2", seed, out, name, compute, described),
+        [pairs],
+        inputs,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from dine.models.state import check_still_wanted
 from dine.provenance import code_digest, run_record
 from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
-from dine.training.loop import history_csv, train
+from dine.training.loop import Job, Seen, history_csv, train
 from dine.training.objective import Objective
 
 
@@ -58,87 +59,97 @@ def starting_backbone(kind: str, arguments: dict[str, Any], start: str, seed: in
     return given
 
 
+@dataclass(frozen=True)
+class Order:
+    """Who asks for a training, and where its results go.
+
+    Attributes:
+        step: the command whose code a saved state is bound to, with that of the classes picked by
+            name.
+        seed: of initial weights and of the order of pairs.
+        out: the folder of the results.
+        name: shown with the progress.
+        compute: how to compute.
+        facts: for the record.
+    """
+
+    step: str
+    seed: int
+    out: Path
+    name: str
+    compute: Compute
+    facts: dict[str, Any]
+
+
 def run(
     backbone: Backbone,
     objective: Objective,
-    pairs_paths: list[Path],
     settings: Training,
-    *,
-    step: str,
-    seed: int,
-    out: Path,
-    name: str,
-    compute: Compute,
+    order: Order,
+    pairs: list[Path],
     inputs: dict[str, Any],
-    facts: dict[str, Any],
-    targets_paths: list[Path] | None = None,
+    targets: list[Path] | None = None,
 ) -> None:
-    """Train and write ``model.safetensors``, ``history.csv`` and ``run.json`` into ``out``.
+    """Train and write ``model.safetensors``, ``history.csv`` and ``run.json``.
 
-    ``step`` is the command whose code a saved state is bound to, with that of the classes picked by
-    name. Where there are other targets, every pair is trained on twice: with its own and with that.
+    ``inputs`` are digests of what the start depends on. Where there are other targets, every pair
+    is trained on twice: with its own and with that.
     """
-    inputs = {"pairs": [file_digest(path) for path in pairs_paths], **inputs}
-    if targets_paths:
-        inputs["targets"] = [file_digest(path) for path in targets_paths]
+    compute, name = order.compute, order.name
+    inputs = {"pairs": [file_digest(path) for path in pairs], **inputs}
+    if targets:
+        inputs["targets"] = [file_digest(path) for path in targets]
     classes = [backbone.registered_name, settings.data_term]
     if objective.prior is not None:
         classes.append(objective.prior.registered_name)
     identity = {
         "settings": digest(settings.model_dump()),
         "backbone": digest([backbone.registered_name, backbone.arguments]),
-        "seed": str(seed),
+        "seed": str(order.seed),
         "precision": compute.precision,
         "inputs": digest(inputs),
-        "code": code_digest(step, *classes),
+        "code": code_digest(order.step, *classes),
     }
-    train_pairs, train_targets = read_seen(pairs_paths, targets_paths, "train")
-    val_pairs, val_targets = read_seen(pairs_paths, targets_paths, "val")
-    if train_targets is not None:
-        train_targets = np.concatenate([train_pairs.target, train_targets])
-        train_pairs = PairSet.concatenate([train_pairs, train_pairs])
+    seen = _twice(Seen(*read_seen(pairs, targets, "train")))
+    validated = Seen(*read_seen(pairs, targets, "val"))
     backbone.precision = compute.precision
+    job = Job(objective, settings, order.seed, order.out / "training", identity, name)
     began = time.monotonic()
     history = train(
-        backbone,
-        objective,
-        train_pairs,
-        val_pairs,
-        settings,
-        train_targets=train_targets,
-        val_targets=val_targets,
-        seed=seed,
-        folder=out / "training",
-        identity=identity,
-        name=name,
-        device=compute.device,
-        processes=compute.processes,
+        backbone, job, seen, validated, device=compute.device, processes=compute.processes
     )
-    check_still_wanted(out / "training", identity, name)
-    made = Network(out)
+    check_still_wanted(job.folder, identity, name)
+    made = Network(order.out)
     # Weights carry nothing that differs between two equal runs, so they can be compared by bytes.
-    save_backbone(made.model, backbone, name=name, seed=seed, steps=settings.steps)
+    save_backbone(made.model, backbone, name=name, seed=order.seed, steps=settings.steps)
     write_text(made.history, history_csv(history))
-    write_json(
-        made.record,
-        run_record(
-            settings.model_dump(),
-            seed,
-            name=name,
-            device=str(chosen_device(compute.device)),
-            processes=compute.processes,
-            precision=compute.precision,
-            threads=torch.get_num_threads(),
-            train_pairs=len(train_pairs),
-            val_pairs=len(val_pairs),
-            inputs=inputs,
-            identity=identity,
-            training_seconds=history[-1]["seconds"],
-            wall_seconds=time.monotonic() - began,
-            final={k: v for k, v in history[-1].items() if k != "step"},
-            **facts,
-        ),
+    measured = {
+        "train_pairs": len(seen.pairs),
+        "val_pairs": len(validated.pairs),
+        "inputs": inputs,
+        "identity": identity,
+        "training_seconds": history[-1]["seconds"],
+        "wall_seconds": time.monotonic() - began,
+        "final": {k: v for k, v in history[-1].items() if k != "step"},
+    }
+    computed = {
+        "device": str(chosen_device(compute.device)),
+        "processes": compute.processes,
+        "precision": compute.precision,
+        "threads": torch.get_num_threads(),
+    }
+    record = run_record(
+        settings.model_dump(), order.seed, name=name, **computed, **measured, **order.facts
     )
+    write_json(made.record, record)
+
+
+def _twice(seen: Seen) -> Seen:
+    """Each pair with its own target and with the other one, where there are others."""
+    if seen.targets is None:
+        return seen
+    targets = np.concatenate([seen.pairs.target, seen.targets])
+    return Seen(PairSet.concatenate([seen.pairs, seen.pairs]), targets)
 
 
 def stage1(
@@ -157,18 +168,14 @@ def stage1(
     start = settings.start
     if start != "random":
         start = file_digest(shipped_weights(kind) if start == "pretrained" else start)
+    facts = {"stage": 1, "backbone": kind, "arguments": backbone.arguments}
     run(
         backbone,
         Objective(DATA_TERMS.get(settings.data_term)()),
-        [pairs],
         settings,
-        step="stage1",
-        seed=seed,
-        out=out,
-        name=name,
-        compute=compute,
-        inputs={"start": start},
-        facts={"stage": 1, "backbone": kind, "arguments": backbone.arguments},
+        Order("stage1", seed, out, name, compute, facts),
+        [pairs],
+        {"start": start},
     )
 
 
@@ -187,17 +194,13 @@ def pretrain(
 
     ``targets`` are variants of all pairs of each file, such as resampled ones, to train on as well.
     """
+    facts = {"stage": 0, "backbone": kind, "data": "synthetic", "arguments": arguments}
     run(
         new_backbone(kind, arguments, seed),
         Objective(DATA_TERMS.get(settings.data_term)()),
-        pairs,
         settings,
-        step="pretrain",
-        seed=seed,
-        out=out,
-        name=f"pretraining/{kind}",
-        compute=compute,
-        targets_paths=targets,
-        inputs={"start": "random"},
-        facts={"stage": 0, "backbone": kind, "data": "synthetic", "arguments": arguments},
+        Order("pretrain", seed, out, f"pretraining/{kind}", compute, facts),
+        pairs,
+        {"start": "random"},
+        targets,
     )

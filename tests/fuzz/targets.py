@@ -413,9 +413,10 @@ def yaml_values(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def configs() -> list[bytes]:
-    whole = config.load(ROOT / "config.yaml")
-    default = (ROOT / "config.yaml").read_bytes()
-    return [default, yaml.safe_dump(whole.model_dump(mode="json")).encode()]
+    files = (ROOT / "config" / "evidence.yaml", ROOT / "config.yaml")
+    whole = config.load(*files)
+    default = functools.reduce(config.merge, map(config.read_yaml, files))
+    return [yaml.safe_dump(x).encode() for x in (default, whole.model_dump(mode="json"))]
 
 
 def configuration(path: Path) -> None:
