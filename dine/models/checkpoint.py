@@ -123,6 +123,11 @@ class _Budget(TorchDispatchMode):
         super().__init__()
         self.left = 10 * weights + 1_000_000
 
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:
+        """No: to mark it as not to be compiled, PyTorch would import its compiler, for a second."""
+        return False
+
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func.overloadpacket.__name__
         if name in _FACTORIES:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from workplace import WARM, warm
+from workplace import WARM, warm, with_default_signals
 
 SCRIPT = """
 import atexit, json, os, signal, sys, threading, time
@@ -50,6 +50,7 @@ def start(tmp_path):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            preexec_fn=with_default_signals,
         )
 
     return run

@@ -400,7 +400,7 @@ def test_from_meshes_of_ones_own_to_a_registration(tmp_path, monkeypatch):
     kept = ("priors", "stage1", "stage2", "lambda_search")
     smaller = {name: small[name] for name in kept} | {"datasets": {"own": pairs}}
     (folder / "smaller.yaml").write_text(yaml.safe_dump(smaller))
-    page = commands(ROOT / "docs" / "own-organ.md")
+    page = commands(ROOT / "docs" / "guide" / "own-organ.md")
     inspect, check, train, register = page[:4]
     for command, said in ((inspect, "5 undeformed objects"), (check, "is valid")):
         words = [word.replace("path/to/meshes", "organs") for word in command]

@@ -29,6 +29,12 @@ class Job(NamedTuple):
     process: psutil.Process
 
 
+def with_default_signals() -> None:
+    """In a child: what was started in the background or with nohup ignores some, and so would it."""
+    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 @functools.cache
 def warm() -> dict[str, str]:
     """Variables with which ``dine`` and Snakemake start as forks of a server; it ends with us."""
@@ -39,6 +45,7 @@ def warm() -> dict[str, str]:
         stdin=subprocess.PIPE,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         start_new_session=True,
+        preexec_fn=with_default_signals,
     )
     atexit.register(server.communicate)
     while not (folder / "socket").exists():
