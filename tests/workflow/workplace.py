@@ -30,7 +30,7 @@ class Job(NamedTuple):
 
 
 def with_default_signals() -> None:
-    """In a child: what was started in the background or with nohup ignores some, and so would it."""
+    """In a child: it would ignore what its parent does, as one in the background ignores Ctrl-C."""
     for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
 
