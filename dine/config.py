@@ -300,6 +300,9 @@ class Training(Section):
     learning_rate: Positive = 3.0e-4
     schedule: Literal["constant", "cosine"] = "cosine"
     """Learning rate over the steps; `cosine` falls to a hundredth."""
+    warmup: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 0
+    """Steps over which the learning rate first rises. AdamW's first steps are as long as the rate
+    whatever the gradient, which throws a trained network out."""
     weight_decay: NonNegative = 0.01
     """AdamW's decoupled weight decay."""
     clip: Positive = 1.0

@@ -298,3 +298,13 @@ def test_cuda_where_there_is_none():
         pytest.skip("this machine has a CUDA device")
     with pytest.raises(DineError, match="no CUDA device"):
         chosen_device("cuda")
+
+
+def test_the_learning_rate_rises_at_first():
+    settings = SETTINGS.model_copy(update={"steps": 100, "warmup": 9})
+    rates = [loop.learning_rate(settings, step) for step in range(100)]
+    plain = [loop.learning_rate(SETTINGS.model_copy(update={"steps": 100}), n) for n in range(100)]
+    assert rates[0] == pytest.approx(plain[0] / 10)
+    assert rates[:9] == sorted(rates[:9])
+    assert rates[9:] == plain[9:]
+    assert rates[9:] == sorted(rates[9:], reverse=True)

@@ -71,10 +71,11 @@ def share_of(team: Team, step: int, batch_size: int, count: int, seed: int) -> R
 
 def learning_rate(settings: Training, step: int) -> float:
     """The scheduled rate of a step."""
+    rate = settings.learning_rate * min(1.0, (step + 1) / (settings.warmup + 1))
     if settings.schedule == "constant":
-        return settings.learning_rate
+        return rate
     cosine = 0.5 * (1 + math.cos(math.pi * step / settings.steps))
-    return settings.learning_rate * (0.01 + 0.99 * cosine)
+    return rate * (0.01 + 0.99 * cosine)
 
 
 def spread(count: int, wanted: int) -> np.ndarray:

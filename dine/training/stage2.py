@@ -94,6 +94,7 @@ def search_lambda(
     settings = stage.model_copy(
         update={
             "steps": search.steps,
+            "warmup": round(stage.warmup * search.steps / stage.steps),
             "validate_every": search.steps,
             "validation_pairs": search.validation_pairs,
         }
