@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from dine.config import Config
 from dine.data.pairs import read_pairs
 from dine.files import read_json
-from dine.priors import PCAPrior, load_prior
+from dine.priors.base import load_prior
+from dine.priors.pca import PCAPrior
 from dine.reporting import figures as draw
 from dine.reporting.loading import load_metrics, origin_of
 from dine.reporting.names import display_name

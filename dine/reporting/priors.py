@@ -10,7 +10,7 @@ from dine.data.fields import read_fields
 from dine.data.pairs import read_pairs
 from dine.errors import DataError
 from dine.files import write_json
-from dine.priors import load_prior
+from dine.priors.base import load_prior
 from dine.priors.diagnostics import diagnose
 from dine.reporting.figures import prior_samples_figure, save_figure
 
