@@ -20,11 +20,13 @@ from dine.registry import Registry
 PRIORS: Registry[Prior] = Registry(
     "prior",
     {
-        name: f"dine.priors.{name}"
-        for name in (
-            *("flow", "gaussian_process", "latent_flow", "pca", "pca_process", "pca_residual"),
-            "smoothness",
-        )
+        "flow": "dine.priors.flow",
+        "gaussian_process": "dine.priors.gaussian_process",
+        "latent_flow": "dine.priors.latent_flow",
+        "pca": "dine.priors.pca",
+        "pca_process": "dine.priors.pca_process",
+        "pca_residual": "dine.priors.pca_residual",
+        "smoothness": "dine.priors.smoothness",
     },
 )
 PRIOR_FORMAT = "dine-prior"
