@@ -302,7 +302,7 @@ class Training(Section):
     """Learning rate over the steps; `cosine` falls to a hundredth."""
     warmup: Annotated[int, BeforeValidator(_no_bool), Field(ge=0)] = 0
     """Steps over which the learning rate first rises. AdamW's first steps are as long as the rate
-    whatever the gradient, which throws a trained network out."""
+    whatever the gradient, which can throw a trained network out."""
     weight_decay: NonNegative = 0.01
     """AdamW's decoupled weight decay."""
     clip: Positive = 1.0
