@@ -336,6 +336,9 @@ class LambdaChoice(Section):
     """How often the grid may go on where the best value lies at its edge."""
     criterion: Literal["cd", "mce"] = "cd"
     """What the best λ has the lowest mean of: Chamfer distance, or mean correspondence error."""
+    tolerance: Annotated[float, Field(ge=0)] = 0.0
+    """Share by which a mean may exceed the lowest and count as no worse, since trainings differ by
+    chance; the largest λ of these is chosen. 0: the lowest alone."""
     steps: Count = 80
     """Stage-2 steps per candidate."""
     validation_pairs: Count = 24

@@ -207,6 +207,10 @@ def even(gain, *, method="pca", **changes):
     )
 
 
+def spoken(metrics, spread=0.0):
+    return headlines(effects(metrics, spread=spread), metrics)
+
+
 @pytest.mark.parametrize(
     ("gain", "spread", "said", "interval"),
     [
@@ -217,7 +221,7 @@ def even(gain, *, method="pca", **changes):
     ],
 )
 def test_headlines_say_what_the_interval_allows(gain, spread, said, interval):
-    (sentence,) = headlines(even(gain), spread=spread)
+    (sentence,) = spoken(even(gain), spread=spread)
     change = f"{-100 * gain:+.0f}".replace("-", "−")
     place = "DeformedTissue with Robust-DefReg"
     assert sentence == f"Known objects (synthetic data): {said} on {place} {change} % ({interval})."
@@ -226,7 +230,7 @@ def test_headlines_say_what_the_interval_allows(gain, spread, said, interval):
 def test_known_objects_come_first_and_each_prior_has_a_sentence():
     unseen = even(-0.5, objects="unseen", dataset="deformedtissue_unseen")
     other = even(0.25, method="flow", backbone="deftransnet")
-    found = headlines(pd.concat([unseen, other, even(0.25)]))
+    found = spoken(pd.concat([unseen, other, even(0.25)]))
     beginnings = [" ".join(sentence.split()[:7]) for sentence in found]
     assert beginnings == [
         "Known objects (synthetic data): DINE-PCA has a",
@@ -239,7 +243,7 @@ def test_known_objects_come_first_and_each_prior_has_a_sentence():
 def test_a_headline_keeps_apart_what_is_decided_and_what_is_not():
     few = even(-0.5, backbone="deftransnet")
     few = few[few["pair"].isin(sorted(few["pair"].unique())[:1])]
-    (sentence,) = headlines(pd.concat([even(0.25), few]))
+    (sentence,) = spoken(pd.concat([even(0.25), few]))
     lower, undecided = sentence.split("; ")
     assert lower.endswith(
         "than the control on DeformedTissue with Robust-DefReg −25 % (−25 to −25)"
@@ -260,12 +264,13 @@ def test_strengths_of_a_condition_are_one_effect_of_pairs_drawn_together():
 def test_headlines_without_control_or_prior():
     metrics = even(0.25)
     for lost in ("lambda0", "pca"):
-        (nothing,) = headlines(metrics[metrics["method"] != lost])
+        (nothing,) = spoken(metrics[metrics["method"] != lost])
         assert nothing.startswith("No prior was evaluated")
 
 
 def test_overview_has_a_column_for_every_condition():
-    table = overview(even(-0.5))
+    metrics = even(-0.5)
+    table = overview(effects(metrics), metrics)
     assert [label for _, label in table.header] == [
         *("Objects", "Dataset", "Backbone", "Prior", "CD, deformation", "CD, noise"),
         *("MCE, deformation", "CD, deformation, against Stage 1"),

@@ -32,7 +32,7 @@ from dine.priors import FlowPrior, load_prior
 from dine.training import stages
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import VALIDATION_COLUMNS
-from dine.training.stage2 import beyond_the_edge, search_lambda, selected_lambda
+from dine.training.stage2 import best_lambda, beyond_the_edge, search_lambda, selected_lambda
 
 numerical = pytest.mark.numerical
 
@@ -96,7 +96,13 @@ def test_how_random_weights_start_is_no_matter_where_weights_are_given():
     ],
 )
 def test_the_grid_goes_on_as_its_last_steps(tried, expected):
-    assert beyond_the_edge(tried) == expected
+    assert beyond_the_edge(list(tried), best_lambda(tried, 0)) == expected
+
+
+@pytest.mark.parametrize(("tolerance", "expected"), [(0, 1e-3), (0.09, 1e-3), (0.1, 1e-2)])
+def test_what_chance_can_hide_is_left_to_the_stronger_prior(tolerance, expected):
+    means = {1e-4: 12.0, 1e-2: 11.0, 1e-3: 10.0, 1e-1: 15.0}
+    assert best_lambda(means, tolerance) == expected
 
 
 @pytest.mark.parametrize(

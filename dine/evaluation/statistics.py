@@ -190,16 +190,16 @@ def paired(
         DataError: a column is missing, the methods have nothing in common, a pair was evaluated
             twice, or the two (or two seeds of one) were evaluated on different pairs.
     """
-    aligned, _ = _aligned(_tidy(metrics, [value]), method, reference, value, backbone)
-    return aligned
+    aligned, _ = _aligned(_tidy(metrics, [value]), method, reference, [value], backbone)
+    return aligned[value]
 
 
 def _aligned(
-    rows: pd.DataFrame, method: str, reference: str, value: str, backbone: str | None
-) -> tuple[pd.DataFrame, dict[str, pd.DataFrame]]:
-    """``paired``, and the values of each seed under ``method`` and ``reference``, same groups.
+    rows: pd.DataFrame, method: str, reference: str, values: Sequence[str], backbone: str | None
+) -> tuple[dict[str, pd.DataFrame], dict[str, pd.DataFrame]]:
+    """``paired`` by value, and the rows of each seed under ``method`` and ``reference``.
 
-    ``rows`` are those of ``_tidy``.
+    ``rows`` are those of ``_tidy``; what is returned is of the groups that the two share.
     """
     ours, theirs = (rows[rows["method"] == name] for name in (method, reference))
     for name, found in ((method, ours), (reference, theirs)):
@@ -208,24 +208,25 @@ def _aligned(
     backbones = sorted({*ours["backbone"], *theirs["backbone"]} - {NO_BACKBONE}) or [NO_BACKBONE]
     if backbone is not None:
         backbones = [name for name in backbones if name == backbone]
-    found, seeds = [], {"method": [], "reference": []}
+    joined, seeds = [], {"method": [], "reference": []}
     for name in backbones:
         mine, other = _of_same_seeds(_of_backbone(ours, name), _of_backbone(theirs, name))
         shared = mine[_GROUP].drop_duplicates().merge(other[_GROUP].drop_duplicates())
         if shared.empty:
             continue
         mine, other = mine.merge(shared), other.merge(shared)
-        found.append(_joined(_over_seeds(mine, value), _over_seeds(other, value), value))
+        joined.append(_joined(_over_seeds(mine, *values), _over_seeds(other, *values), values))
         seeds["method"].append(mine)
         seeds["reference"].append(other)
-    if not found:
+    if not joined:
         where = "" if backbone is None else f" with the backbone {backbone!r}"
         raise DataError(
             f"The methods {method!r} and {reference!r} have no dataset and condition in "
             f"common{where}."
         )
+    both = pd.concat(joined, ignore_index=True)
     return (
-        pd.concat(found, ignore_index=True),
+        {value: _with_value(both, value) for value in values},
         {name: pd.concat(parts, ignore_index=True) for name, parts in seeds.items()},
     )
 
@@ -249,26 +250,29 @@ def _of_same_seeds(ours: pd.DataFrame, theirs: pd.DataFrame) -> tuple[pd.DataFra
     return ours[ours["seed"].isin(common)], theirs[theirs["seed"].isin(common)]
 
 
-def _joined(ours: pd.DataFrame, theirs: pd.DataFrame, value: str) -> pd.DataFrame:
+def _joined(ours: pd.DataFrame, theirs: pd.DataFrame, values: Sequence[str]) -> pd.DataFrame:
+    """The pairs of both; the reference's values are called ``<value>_of_reference``."""
     keys = [*_GROUP, *_PAIR]
-    both = ours[[*keys, "method", value]].merge(
-        theirs[[*keys, "method", value]], on=keys, how="outer", suffixes=("", "_of_reference")
+    both = ours[[*keys, "method", *values]].merge(
+        theirs[[*keys, "method", *values]], on=keys, how="outer", suffixes=("", "_of_reference")
     )
-    reference = f"{value}_of_reference"
-    alone = both[value].isna() != both[reference].isna()
-    if alone.any():
-        row = both[alone].iloc[0]
-        raise DataError(
-            f"{ours['method'].iloc[0]!r} and {theirs['method'].iloc[0]!r} were evaluated on "
-            f"different pairs of {row['dataset']} ({row['condition']}, {row['backbone']}): "
-            f"{int(alone.sum())} have a {value} of one only, such as {row['pair']!r}."
-        )
-    both = both[both[value].notna()]
-    return both[keys].assign(
-        method=both[value],
-        reference=both[reference],
-        difference=both[value] - both[reference],
-    )
+    for value in values:
+        alone = both[value].isna() != both[f"{value}_of_reference"].isna()
+        if alone.any():
+            row = both[alone].iloc[0]
+            raise DataError(
+                f"{ours['method'].iloc[0]!r} and {theirs['method'].iloc[0]!r} were evaluated on "
+                f"different pairs of {row['dataset']} ({row['condition']}, {row['backbone']}): "
+                f"{int(alone.sum())} have a {value} of one only, such as {row['pair']!r}."
+            )
+    return both
+
+
+def _with_value(both: pd.DataFrame, value: str) -> pd.DataFrame:
+    """The pairs that have a value, with its ``difference``."""
+    known = both[both[value].notna()]
+    ours, theirs = known[value], known[f"{value}_of_reference"]
+    return known[[*_GROUP, *_PAIR]].assign(method=ours, reference=theirs, difference=ours - theirs)
 
 
 def _tidy(metrics: pd.DataFrame, values: Iterable[str]) -> pd.DataFrame:
@@ -351,40 +355,41 @@ def compare(
         DataError: see ``paired``.
     """
     rows = _tidy(metrics, ["mce", *values])
-    found = {v: _aligned(rows, method, reference, v, None) for v in dict.fromkeys(["mce", *values])}
-    errors, _ = found["mce"]
-    # Pairs without known correspondences can neither fail nor succeed: NaN after the merge.
-    failed = errors[[*_GROUP, "pair"]].assign(
+    found, by_seed = _aligned(rows, method, reference, list(dict.fromkeys(["mce", *values])), None)
+    failed = _failed(found["mce"])
+    records = []
+    for value in values:
+        aligned = found[value].merge(failed, on=[*_GROUP, "pair"], how="left")
+        spread = {side: _seed_spread(rows, value) for side, rows in by_seed.items()}
+        names = {"value": value, "method": method, "reference": reference}
+        for level, at_level in _levels(aligned):
+            for key, some in at_level.groupby(_GROUP, sort=False):
+                place = {**dict(zip(_GROUP, key, strict=True)), "level": level}
+                seeds = {
+                    f"{name}_{side}": number
+                    for side in ("method", "reference")
+                    for name, number in spread[side][_hashable((*key, level))].items()
+                }
+                measured = {**_difference(some, samples, seed), **_failures(some)}
+                records.append({**place, **names, **measured, **seeds})
+    if not records:
+        raise DataError(f"No pair has a {' or a '.join(values)} to compare.")
+    return _in_order(pd.DataFrame(records), values)
+
+
+def _failed(errors: pd.DataFrame) -> pd.DataFrame:
+    """Whether the mean correspondence error of each pair counts as a failure, as numbers.
+
+    Pairs without known correspondences can neither fail nor succeed: NaN once merged.
+    """
+    return errors[[*_GROUP, "pair"]].assign(
         failed_method=(errors["method"] > FAILURE).astype(float),
         failed_reference=(errors["reference"] > FAILURE).astype(float),
     )
-    records = []
-    for value in values:
-        aligned, by_seed = found[value]
-        aligned = aligned.merge(failed, on=[*_GROUP, "pair"], how="left")
-        spread = {side: _seed_spread(rows, value) for side, rows in by_seed.items()}
-        for level, rows in _levels(aligned):
-            for key, some in rows.groupby(_GROUP, sort=False):
-                place = (*key, level)
-                records.append(
-                    {
-                        **dict(zip(_GROUP, key, strict=True)),
-                        "level": level,
-                        "value": value,
-                        "method": method,
-                        "reference": reference,
-                        **_difference(some, samples, seed),
-                        **_failures(some),
-                        **{
-                            f"{name}_{side}": number
-                            for side in ("method", "reference")
-                            for name, number in spread[side][_hashable(place)].items()
-                        },
-                    }
-                )
-    if not records:
-        raise DataError(f"No pair has a {' or a '.join(values)} to compare.")
-    table = pd.DataFrame(records)
+
+
+def _in_order(table: pd.DataFrame, values: Sequence[str]) -> pd.DataFrame:
+    """The rows of ``compare`` by place, value and level, with p-values adjusted by family."""
     family = [*_GROUP[:-1], "value", table["level"].isna().rename("all")]
     table.insert(
         table.columns.get_loc("p") + 1, "p_holm", table.groupby(family)["p"].transform(holm)
@@ -540,11 +545,13 @@ def _failures(rows: pd.DataFrame) -> dict[str, float]:
 def _seed_spread(rows: pd.DataFrame, value: str) -> dict[tuple, dict[str, float]]:
     """Number of seeds and standard deviation of their means, by group and level."""
     found = {}
-    for level, some in _levels(rows):
-        means = some.groupby([*_GROUP, "seed"], sort=False)[value].mean()
-        for key, by_seed in means.groupby(level=_GROUP, sort=False):
-            place = _hashable((*key, level))
-            found[place] = {"seeds": len(by_seed), "seed_sd": by_seed.std(ddof=1)}
+    for extra in (["level"], []):
+        means = rows.groupby([*_GROUP, *extra, "seed"], sort=False)[value].mean()
+        places = means.groupby(level=[*_GROUP, *extra], sort=False)
+        spread = pd.DataFrame({"seeds": places.size(), "seed_sd": places.std(ddof=1)})
+        for key, seeds, deviation in spread.itertuples(name=None):
+            place = _hashable(key if extra else (*key, float("nan")))
+            found[place] = {"seeds": seeds, "seed_sd": deviation}
     return found
 
 

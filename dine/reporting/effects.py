@@ -7,6 +7,7 @@ undecided.
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 
 from dine.config import CONTROL, STAGE1
@@ -29,9 +30,9 @@ def effects(
     """
     # A pair counts once for each strength; drawn by cluster, its rows stay together.
     strength = metrics["corruption"].map("{:g}".format)
-    pooled = metrics.assign(corruption=0.0, pair=metrics["pair"] + " " + strength)
+    pooled = metrics.assign(corruption=0.0, level=np.nan, pair=metrics["pair"] + " " + strength)
     found = verdicts(pooled[pooled[value].notna()], reference, value, spread=spread)
-    found = found[found["level"].isna() & ~found["method"].isin([STAGE1, CONTROL])]
+    found = found[~found["method"].isin([STAGE1, CONTROL])]
     kinds = metrics.groupby("dataset")["objects"].first()
     found = found.assign(objects=found["dataset"].map(kinds))
     orders = {"method": names.METHODS, "backbone": names.BACKBONES, "objects": [KNOWN]}
@@ -43,10 +44,12 @@ def effects(
     )
 
 
-def headlines(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[str]:
-    """A sentence for each kind of objects and each prior: against the control, on clean targets."""
-    table = effects(metrics, spread=spread)
-    table = table[table["condition"] == CLEAN]
+def headlines(control: pd.DataFrame, metrics: pd.DataFrame) -> list[str]:
+    """A sentence for each kind of objects and each prior, on clean targets.
+
+    ``control`` is the table of ``effects`` against the control.
+    """
+    table = control[control["condition"] == CLEAN]
     groups = table.groupby(["objects", "method"], sort=False)
     found = [_headline(method, kind, rows, metrics) for (kind, method), rows in groups]
     return found or ["No prior was evaluated in this run, so there is nothing to compare."]
@@ -73,9 +76,11 @@ def _headline(method: str, objects: str, rows: pd.DataFrame, metrics: pd.DataFra
     return f"{kind}: {'; '.join(parts)}."
 
 
-def overview(metrics: pd.DataFrame, *, spread: float = 0.0) -> Table | None:
-    """Each prior's differences under every condition, with what follows; None without priors."""
-    control = effects(metrics, spread=spread)
+def overview(control: pd.DataFrame, metrics: pd.DataFrame, *, spread: float = 0.0) -> Table | None:
+    """Each prior's differences under every condition, with what follows; None without priors.
+
+    ``control`` is the table of ``effects`` against the control.
+    """
     if control.empty:
         return None
     errors = effects(metrics, value="mce", spread=spread)

@@ -43,6 +43,7 @@ _OTHER_STYLES = [
 ]
 _ERROR_COLOURS = "coolwarm"
 _UNIT = "×10⁻⁴"
+_POINTS = {"linewidth": 0, "rasterized": True}  # thousands of paths in a PDF are slow to show
 _SMALL = {"fontsize": 8, "frameon": False}
 
 
@@ -70,6 +71,7 @@ def save_figure(figure: Figure, path_stem: str | os.PathLike) -> list[Path]:
         path = Path(f"{path_stem}.{suffix}")
         with atomic_path(path) as temporary:
             canvas.print_figure(temporary, dpi=150, metadata=metadata, facecolor="white")
+        figure.set_layout_engine("none")  # found once; it takes as long as drawing
         paths.append(path)
     return paths
 
@@ -338,17 +340,17 @@ def _example_row(
     for axes in line:
         _bare_axes(axes, limits)
     seen = target if example.seen is None else (example.seen - centre) @ rotation
-    line[0].scatter(*source.T, s=4, color="#E69F00", linewidth=0, label="source")
-    line[0].scatter(*seen.T, s=4, color="#999999", linewidth=0, label="target")
+    line[0].scatter(*source.T, s=4, color="#E69F00", label="source", **_POINTS)
+    line[0].scatter(*seen.T, s=4, color="#999999", label="target", **_POINTS)
     line[0].text2D(
         -0.02, 0.5, example.label, rotation=90, va="center", ha="right",
         transform=line[0].transAxes, multialignment="center",
     )  # fmt: skip
     for axes, method in zip(line[1:], methods, strict=True):
-        axes.scatter(*target.T, s=2, color="#BBBBBB", linewidth=0, alpha=0.5)
+        axes.scatter(*target.T, s=2, color="#BBBBBB", alpha=0.5, **_POINTS)
         cloud = (example.registered[method] - centre) @ rotation
         colours = {"c": example.errors[method], "cmap": _ERROR_COLOURS, "norm": norm}
-        axes.scatter(*cloud.T, s=6, **colours, linewidth=0, depthshade=False)
+        axes.scatter(*cloud.T, s=6, **colours, depthshade=False, **_POINTS)
 
 
 def _views(figure: Figure, down: int, across: int) -> np.ndarray:
@@ -563,7 +565,7 @@ def pca_modes_figure(
 
 
 def _coloured(axes: Any, cloud: np.ndarray, values: np.ndarray, norm: Normalize) -> None:
-    axes.scatter(*cloud.T, s=5, c=values, cmap="viridis", norm=norm, linewidth=0)
+    axes.scatter(*cloud.T, s=5, c=values, cmap="viridis", norm=norm, **_POINTS)
 
 
 def prior_samples_figure(

@@ -13,7 +13,7 @@ from dine.config import STAGE1, Config
 from dine.files import read_json
 from dine.provenance import versions
 from dine.reporting.build import Run
-from dine.reporting.effects import headlines, overview
+from dine.reporting.effects import effects, headlines, overview
 from dine.reporting.html import (
     Beside,
     Item,
@@ -101,7 +101,8 @@ def result_sections(
                 apart.append(picture)
         figures += [Part("heading", heading), *apart] if apart else []
     tables = [Beside([table, *beside.get(table.name, [])]) for table in all_tables(metrics, spread)]
-    findings = [headlines(metrics, spread=spread), overview(metrics, spread=spread)]
+    control = effects(metrics, spread=spread)
+    findings = [headlines(control, metrics), overview(control, metrics, spread=spread)]
     return [
         Section("findings", "Findings", findings),
         Section("tables", "Tables", tables),

@@ -121,7 +121,8 @@ def summary(
 
 def _decided(metrics: pd.DataFrame, value: str, spread: float) -> pd.DataFrame:
     """``verdicts`` against the control: by level on clean targets, pooled on others."""
-    found = verdicts(metrics, "lambda0", value, spread=spread)
+    levels = metrics["level"].where(metrics["condition"] == CLEAN)
+    found = verdicts(metrics.assign(level=levels), "lambda0", value, spread=spread)
     return found[found["level"].notna() == (found["condition"] == CLEAN)]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dine.config import CONTROL, Compute, LambdaSearch, Stage2
@@ -84,11 +84,12 @@ def search_lambda(
     out: Path,
     compute: Compute = COMPUTE,
 ) -> None:
-    """Try each λ on a shortened Stage 2; the lowest mean of the criterion on validation pairs wins.
+    """Try each λ on a shortened Stage 2 and choose by the criterion's mean on validation pairs.
 
-    Where the best lies at the edge of the grid, the grid goes on there, at most ``search.extend``
-    times for each prior. λ = 0 is trained too, once, for comparison, but never chosen. Each
-    candidate's result is kept, so that an interrupted search goes on with the next one.
+    ``best_lambda`` chooses; where its choice lies at the edge of the grid, the grid goes on
+    there, at most ``search.extend`` times for each prior. λ = 0 is trained too, once, for
+    comparison, but never chosen. Each candidate's result is kept, so that an interrupted
+    search goes on with the next one.
     """
     # One validation, at the end, on more pairs than training looks at.
     settings = stage.model_copy(
@@ -118,16 +119,20 @@ def search_lambda(
         final = read_json(Network(here).record)["final"]
         return {name.removeprefix("val_"): final[name] for name in VALIDATION_COLUMNS}
 
+    def best(tried: dict[float, dict[str, float]]) -> float:
+        means = {weight: found[search.criterion] for weight, found in tried.items()}
+        return best_lambda(means, search.tolerance)
+
     control = errors(CONTROL, 0.0)
     curve, selected = [], {}
     for prior in priors:
         tried = {weight: errors(prior, weight) for weight in sorted(search.candidates)}
         for _ in range(search.extend):
-            further = beyond_the_edge({x: found[search.criterion] for x, found in tried.items()})
+            further = beyond_the_edge(list(tried), best(tried))
             if further is None:
                 break
             tried[further] = errors(prior, further)
-        selected[prior] = min(sorted(tried), key=lambda weight: tried[weight][search.criterion])
+        selected[prior] = best(tried)
         # The control is every prior's value at λ = 0.
         rows = {0.0: control, **dict(sorted(tried.items()))}
         curve += [{"prior": prior, "lambda": weight, **found} for weight, found in rows.items()]
@@ -139,6 +144,7 @@ def search_lambda(
             "default": next(iter(priors)),
             "selected": selected,
             "criterion": search.criterion,
+            "tolerance": search.tolerance,
             "curve": curve,
             "steps": search.steps,
             "validation_pairs": search.validation_pairs,
@@ -147,8 +153,19 @@ def search_lambda(
     )
 
 
-def beyond_the_edge(tried: Mapping[float, float]) -> float | None:
-    """The next λ to try where the best of the tried ones, by value, is the largest or smallest.
+def best_lambda(means: Mapping[float, float], tolerance: float) -> float:
+    """The largest λ whose mean error exceeds the lowest by no more than a share ``tolerance``.
+
+    Two trainings of one λ differ by chance, and among those that this hides the one with the
+    strongest prior says most: the idea of the one-standard-error rule of Breiman et al. (1984),
+    Classification and Regression Trees, section 3.4.3.
+    """
+    bound = (1 + tolerance) * min(means.values())
+    return max(weight for weight, mean in means.items() if mean <= bound)
+
+
+def beyond_the_edge(tried: Sequence[float], best: float) -> float | None:
+    """The next λ to try where the best of the tried ones is the largest or smallest.
 
     It is as many times larger or smaller as the last two are apart; None where the best lies inside
     the grid, or there is only one.
@@ -156,7 +173,6 @@ def beyond_the_edge(tried: Mapping[float, float]) -> float | None:
     weights = sorted(tried)
     if len(weights) < 2:
         return None
-    best = min(weights, key=tried.__getitem__)
     inner = {weights[0]: weights[1], weights[-1]: weights[-2]}.get(best)
     # Rounded, so that names and numbers of 1e-4 · 10 are those of 1e-3.
     return None if inner is None else float(f"{best * best / inner:.6g}")
