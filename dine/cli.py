@@ -826,6 +826,11 @@ def registration_options(command):
         ),
         click.option("--partial", is_flag=True, help="The target shows a part of the source only."),
         click.option(
+            "--surfaces",
+            is_flag=True,
+            help="Go on from the points to the surfaces; on trial, see docs/guide/register.md.",
+        ),
+        click.option(
             "--map",
             "rounds",
             type=click.IntRange(0),
@@ -886,6 +891,7 @@ def register(
     landmarks,
     prealign,
     rounds,
+    surfaces,
     partial,
     points,
     seed,
@@ -917,6 +923,7 @@ def register(
         apply=shapes,
         landmarks=tuple(marks) if marks else None,
         rounds=rounds,
+        surfaces=surfaces,
         partial=partial,
         points=points,
         seed=seed,
@@ -954,7 +961,18 @@ def register(
 @registration_options
 @model_options
 def register_many(
-    manifest, out, suffix, prealign, rounds, partial, points, seed, view, load_model, device
+    manifest,
+    out,
+    suffix,
+    prealign,
+    rounds,
+    surfaces,
+    partial,
+    points,
+    seed,
+    view,
+    load_model,
+    device,
 ):
     """Register every pair of MANIFEST, a CSV file (source, target, name) or a folder.
 
@@ -968,6 +986,7 @@ def register_many(
     settings = {
         "prealign": _alignment(prealign),
         "rounds": rounds,
+        "surfaces": surfaces,
         "partial": partial,
         "points": points,
         "seed": seed,
@@ -986,21 +1005,38 @@ def register_many(
 @model_option
 @click.option("--pairs", type=IN, multiple=True, required=True, help="Pairs (HDF5); repeatable.")
 @targets_option
+@click.option(
+    "--raw",
+    "raws",
+    type=IN,
+    multiple=True,
+    help="Of `raw`: the datasets that the pairs were made from, to calibrate on their meshes.",
+)
 @click.option("--prior", type=IN, help="The prior that the trust score is to use.")
 @click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto")
 @click.option("--out", type=OUT, required=True, help="Calibration to write (JSON, and a plot).")
-def calibrate(model, pairs, targets, prior, device, out):
+def calibrate(model, pairs, targets, raws, prior, device, out):
     """Learn from validation pairs what a model's uncertainty means; check it on test pairs.
 
+    With --raw for `register --surfaces`, on the meshes that the pairs were drawn on.
+
     Example: dine calibrate --model model.safetensors --pairs pairs.h5 --targets resampled.h5
-    --prior pca.safetensors --out calibration.json
+    --raw raw.json --prior pca.safetensors --out calibration.json
     """
     from dine.models.devices import chosen_device, leased
     from dine.registration.calibrate import calibrate as run
 
     _start_torch()
     with leased(chosen_device(device)) as [found]:
-        run(model, list(pairs), out, targets=list(targets), prior=prior, device=found)
+        run(
+            model,
+            list(pairs),
+            out,
+            targets=list(targets),
+            raws=list(raws),
+            prior=prior,
+            device=found,
+        )
 
 
 def main() -> None:

@@ -5,7 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from dine.priors.gaussian import LinearGaussian, covariance_root, squared_exponential
+from dine.priors.gaussian import (
+    LinearGaussian,
+    Posterior,
+    covariance_root,
+    fitted_root,
+    squared_exponential,
+)
 
 pytestmark = pytest.mark.numerical
 WIDTHS, AMPLITUDES, AFFINE = (0.9, 1.5), (0.2, 0.5), 0.4
@@ -61,3 +67,64 @@ def test_a_kernel_alone_is_a_model_without_modes():
     assert model.mean.shape == (6, 3)
     assert not model.mean.any()
     assert model.modes.shape == (0, 6, 3)
+
+
+def test_a_root_goes_on_as_the_process_does():
+    points, others = cloud(40), cloud(15, seed=1)
+    fitted = fitted_root(points, WIDTHS, AMPLITUDES, AFFINE, rank=40, tolerance=0)
+    assert np.allclose(fitted.at(points), fitted.root, atol=1e-7)
+    # All points are pivots, so that the covariance with them is exact.
+    expected = squared_exponential(others, points, WIDTHS, AMPLITUDES, AFFINE)
+    assert np.allclose(fitted.at(others) @ fitted.root.T, expected, atol=1e-7)
+
+
+def observed(points=12, kernel=4, modes=3, seed=0):
+    """A prior, and sums of precisions and of weighted values at its points."""
+    rng = np.random.default_rng(seed)
+    prior = LinearGaussian(
+        rng.normal(size=(points, 3)),
+        rng.normal(size=(modes, points, 3)),
+        rng.normal(size=(points, kernel)),
+    )
+    half = rng.normal(size=(points, 3, 2))  # nothing is known in one direction
+    precision = half @ half.transpose(0, 2, 1)
+    pulled = np.einsum("nab,nb->na", precision, rng.normal(size=(points, 3)))
+    return prior, pulled, precision
+
+
+def dense(prior):
+    """(3N, R + 3r) matrix of the prior: fields are mean + matrix · standard normal numbers."""
+    columns = [mode.ravel() for mode in prior.modes]
+    for axis in range(3):
+        for column in prior.kernel.T:
+            field = np.zeros((len(prior.mean), 3))
+            field[:, axis] = column
+            columns.append(field.ravel())
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize(("kernel", "modes"), [(4, 3), (4, 0), (0, 3)])
+def test_a_posterior_is_that_of_linear_regression(kernel, modes):
+    prior, pulled, precision = observed(kernel=kernel, modes=modes)
+    found = Posterior(prior, pulled, precision)
+    design = dense(prior)
+    weight = np.zeros((design.shape[0],) * 2)
+    for point, block in enumerate(precision):
+        weight[3 * point : 3 * point + 3, 3 * point : 3 * point + 3] = block
+    covariance = np.linalg.inv(design.T @ weight @ design + np.eye(design.shape[1]))
+    amplitudes = covariance @ design.T @ (pulled.ravel() - weight @ prior.mean.ravel())
+    assert np.allclose(found.mean.ravel(), prior.mean.ravel() + design @ amplitudes)
+    assert found.energy == pytest.approx(0.5 * (amplitudes**2).sum())
+    variances = np.diag(design @ covariance @ design.T).reshape(-1, 3).sum(axis=1)
+    assert np.allclose(found.variance(prior.kernel, prior.modes), variances)
+
+
+def test_without_observations_a_posterior_is_the_prior():
+    prior, _, _ = observed()
+    nothing = Posterior(prior, np.zeros((12, 3)), np.zeros((12, 3, 3)))
+    assert np.allclose(nothing.mean, prior.mean)
+    assert np.allclose(nothing.variance(prior.kernel, prior.modes), prior_variance(prior))
+
+
+def prior_variance(prior):
+    return (dense(prior) ** 2).sum(axis=1).reshape(-1, 3).sum(axis=1)

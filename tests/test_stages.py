@@ -631,3 +631,30 @@ def test_targets_of_other_pairs_are_refused(chain, resampled, tmp_path):
     write_pairs(other, pairs)
     with pytest.raises(DataError, match="made from other pairs"):
         read_seen([other], [resampled], "train")
+
+
+def test_calibration_on_the_meshes_that_pairs_were_drawn_on(chain, tmp_path):
+    resampled = tmp_path / "resampled.h5"
+    data = ("--pairs", chain / "pairs.h5")
+    raw = ("--raw", chain / "raw.json")
+    dine("resample", *raw, *data, "--out", resampled)
+    model = ("--model", chain / "stage1" / "model.safetensors")
+    command = ("calibrate", *model, *data, "--targets", resampled, *raw)
+    dine(*command, "--out", tmp_path / "c.json")
+    facts = read_json(tmp_path / "c.json")["facts"]
+    assert facts["surfaces"]
+    assert facts["test_mean_error"] < 0.05
+
+
+def test_calibration_refuses_raw_files_that_fit_no_pairs(chain, tmp_path):
+    model = ("--model", chain / "stage1" / "model.safetensors", "--out", tmp_path / "c.json")
+    resampled = tmp_path / "resampled.h5"
+    data = ("--pairs", chain / "pairs.h5")
+    dine("resample", "--raw", chain / "raw.json", *data, "--out", resampled)
+    raws = ("--raw", chain / "raw.json") * 3
+    both = (*data, *data, "--targets", resampled, "--targets", resampled)
+    with pytest.raises(ConfigError, match="3 raw datasets for 2 files of pairs"):
+        dine("calibrate", *model, *both, *raws)
+    with pytest.raises(DataError, match="hold the same points"):
+        dine("calibrate", *model, *data)
+    assert not (tmp_path / "c.json").exists()

@@ -111,20 +111,13 @@ def resample_targets(
     Raises:
         DataError: the pairs were not made from these raw files.
     """
-    files = {pair.id: pair for path in raws for pair in obtained(path)[0].clean}
     pairs = read_pairs(pairs_path)
     checksum = pairs.checksum
     pairs = at_levels(pairs, levels) if most is None else evaluated_pairs(pairs, levels, most)
-    missing = [name for name in pairs.name.tolist() if name not in files]
-    if missing:
-        raise DataError(
-            f"{pairs_path} was not made from {' and '.join(map(str, raws))}, "
-            f"which lacks {missing[0]!r}."
-        )
+    files = files_of(raws, pairs, pairs_path)
     targets = np.empty_like(pairs.target)
     with Progress("resampled targets", len(pairs), unit="pair") as bar:
-        for row, name in enumerate(pairs.name.tolist()):
-            pair = files[name]
+        for row, pair in enumerate(files):
             source, target = read_surface(pair.source), read_surface(pair.target)
             check_pair(source, target, pair.name)
             rng = keyed_rng(seed, "resampled", pair.object)
@@ -133,6 +126,21 @@ def resample_targets(
             bar.update()
     inlier = np.ones(targets.shape[:2], bool)
     write_variant(out, Variant(RESAMPLED, 1.0, targets, inlier, pairs.name), checksum)
+
+
+def files_of(raws: Sequence[Path], pairs: PairSet, name: Path) -> list[PairFiles]:
+    """The files that each pair of a set, read from the file ``name``, was made from.
+
+    Raises:
+        DataError: a pair was not made from these raw files.
+    """
+    files = {pair.id: pair for path in raws for pair in obtained(path)[0].clean}
+    missing = [pair for pair in pairs.name.tolist() if pair not in files]
+    if missing:
+        raise DataError(
+            f"{name} was not made from {' and '.join(map(str, raws))}, which lacks {missing[0]!r}."
+        )
+    return [files[pair] for pair in pairs.name.tolist()]
 
 
 def measure_agreement(path: Path, *, seed: int) -> dict[str, object]:

@@ -98,7 +98,7 @@ class FittedDisplacement:
             DataError: another shape, or numbers that are NaN or infinite.
         """
         places = (_finite("queries", queries, 3) - self._centre) / self._radius
-        near = _within_reach(places)
+        near = within_reach(places)
         affine = self._rigid(places) + (near - self._middle) @ self._gradient
         return (affine + _evaluated(self._spline, near, 3)) * self._radius
 
@@ -130,7 +130,7 @@ class FittedValues:
             DataError: another shape, or numbers that are NaN or infinite.
         """
         places = (_finite("queries", queries, 3) - self._centre) / self._radius
-        values = _evaluated(self._spline, _within_reach(places), len(self._bounds[0]))
+        values = _evaluated(self._spline, within_reach(places), len(self._bounds[0]))
         return np.clip(values, *self._bounds)
 
 
@@ -208,7 +208,7 @@ def _evaluated(spline: RBFInterpolator, places: np.ndarray, columns: int) -> np.
     return spline(places) if len(places) else np.empty((0, columns))
 
 
-def _within_reach(places: np.ndarray) -> np.ndarray:
+def within_reach(places: np.ndarray) -> np.ndarray:
     """Places farther out than ``_REACH`` drawn straight towards the middle."""
     distance = np.linalg.norm(places, axis=1, keepdims=True)
     return places * (_REACH / np.maximum(distance, _REACH))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
 
 
@@ -50,6 +51,32 @@ def squared_exponential(
     return total
 
 
+@dataclass(frozen=True)
+class CovarianceRoot:
+    """A root L of :func:`squared_exponential` at (N, 3) points, with L Lᵀ ≈ K, that goes on.
+
+    Attributes:
+        root: (N, r) at the points.
+        pivots: (r, 3) points that the others are explained by.
+        lower: (r, r) root at the pivots, lower triangular.
+        kernel: widths, amplitudes and affine part of the covariance.
+    """
+
+    root: np.ndarray
+    pivots: np.ndarray
+    lower: np.ndarray
+    kernel: tuple[Sequence[float], Sequence[float], float]
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """(M, r) rows for any places (M, 3): those of the points themselves at these.
+
+        Fields root · C go on as their expectation given the pivots (Nyström); see Rasmussen and
+        Williams (2006), Gaussian Processes for Machine Learning, section 8.1.
+        """
+        covariance = squared_exponential(places, self.pivots, *self.kernel)
+        return solve_triangular(self.lower, covariance.T, lower=True, check_finite=False).T
+
+
 def covariance_root(
     points: np.ndarray,
     widths: Sequence[float],
@@ -59,7 +86,20 @@ def covariance_root(
     rank: int = 128,
     tolerance: float = 1e-4,
 ) -> np.ndarray:
-    """(N, r) root L of :func:`squared_exponential` at points (N, 3), with L Lᵀ ≈ K.
+    """The (N, r) root of :func:`fitted_root`."""
+    return fitted_root(points, widths, amplitudes, affine, rank=rank, tolerance=tolerance).root
+
+
+def fitted_root(
+    points: np.ndarray,
+    widths: Sequence[float],
+    amplitudes: Sequence[float],
+    affine: float = 0.0,
+    *,
+    rank: int = 128,
+    tolerance: float = 1e-4,
+) -> CovarianceRoot:
+    """A root of :func:`squared_exponential` at points (N, 3).
 
     Pivoted Cholesky (Harbrecht, Peters and Schneider, 2012): each step takes the point that the
     earlier ones explain least, until the largest variance left is below ``tolerance`` times the
@@ -69,12 +109,77 @@ def covariance_root(
     left = affine**2 * ((points**2).sum(axis=1) + 1) + float(np.square(amplitudes).sum())
     enough = tolerance * left.max()
     root = np.zeros((len(points), min(rank, len(points))))
+    pivots: list[int] = []
     for column in range(root.shape[1]):
         pivot = int(np.argmax(left))
         if left[pivot] <= enough:
-            return root[:, :column]
+            root = root[:, :column]
+            break
         row = squared_exponential(points, points[pivot : pivot + 1], widths, amplitudes, affine)
         known = root[:, :column]
         root[:, column] = (row[:, 0] - known @ known[pivot]) / np.sqrt(left[pivot])
         left = np.maximum(left - root[:, column] ** 2, 0)
-    return root
+        pivots.append(pivot)
+    return CovarianceRoot(root, points[pivots], root[pivots], (widths, amplitudes, affine))
+
+
+class Posterior:
+    """A Gaussian field given noisy values at its points, each of an own precision in space.
+
+    One solve of R + 3r unknowns: N·r² operations for the kernel's six blocks, and (R + 3r)³ / 3.
+
+    Args:
+        prior: of N points.
+        pulled: (N, 3) sums of precision · value over what was observed at each point.
+        precision: (N, 3, 3) sums of the precisions, symmetric.
+
+    Attributes:
+        mean: (N, 3), the most probable field.
+        shared: (R,) amplitudes of the prior's modes.
+        alone: (r, 3) amplitudes of its kernel.
+        energy: half the squared length of both, −log of the prior's density up to a constant.
+        complexity: half the log-determinant of the posterior precision relative to the prior's;
+            −log evidence is misfit + energy + complexity (MacKay, 1992, Bayesian interpolation).
+    """
+
+    def __init__(self, prior: LinearGaussian, pulled: np.ndarray, precision: np.ndarray):
+        modes, kernel = prior.modes, prior.kernel
+        first, rank = len(modes), kernel.shape[1]
+        size = first + 3 * rank
+        pulled = pulled - np.einsum("nab,nb->na", precision, prior.mean)
+        system, right = np.zeros((size, size)), np.empty(size)
+        at = [slice(first + axis * rank, first + (axis + 1) * rank) for axis in range(3)]
+        for a in range(3):
+            right[at[a]] = kernel.T @ pulled[:, a]
+            for b in range(a + 1):
+                system[at[a], at[b]] = kernel.T @ (precision[:, a, b, None] * kernel)
+        if first:
+            heavy = np.einsum("nab,rnb->rna", precision, modes)
+            system[:first, :first] = heavy.reshape(first, -1) @ modes.reshape(first, -1).T
+            right[:first] = modes.reshape(first, -1) @ pulled.ravel()
+            for a in range(3):
+                system[at[a], :first] = kernel.T @ heavy[:, :, a].T
+        system[np.diag_indices(size)] += 1
+        # Only the lower triangle is read.
+        self._factor = cho_factor(system, lower=True, overwrite_a=True, check_finite=False)
+        found = cho_solve(self._factor, right, check_finite=False)
+        self.shared, self.alone = found[:first], found[first:].reshape(3, rank).T
+        self.mean = prior.mean + kernel @ self.alone
+        if first:
+            self.mean += np.tensordot(self.shared, modes, axes=1)
+        self.energy = 0.5 * float((found**2).sum())
+        self.complexity = float(np.log(np.diag(self._factor[0])).sum())
+
+    def variance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
+        """Sum (M,) of the field's three variances where the prior has these rows of its kernel
+        (M, r), and modes (R, M, 3) if it has any."""
+        first, rank = len(self.shared), len(self.alone)
+        total = np.zeros(len(kernel))
+        for axis in range(3):
+            rows = np.zeros((first + 3 * rank, len(kernel)))
+            if first:
+                rows[:first] = modes[:, :, axis]
+            rows[first + axis * rank : first + (axis + 1) * rank] = kernel.T
+            solved = solve_triangular(self._factor[0], rows, lower=True, check_finite=False)
+            total += (solved**2).sum(axis=0)
+        return total

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dine.priors.gaussian import LinearGaussian, covariance_root
+from dine.priors.gaussian import CovarianceRoot, LinearGaussian, fitted_root
 
 OUTLIERS = 0.1
 """Share of the target points that lie anywhere, and not near a moved source point."""
@@ -21,7 +21,8 @@ class Smoothness(NamedTuple):
     """A Gaussian process of displacements: widths and standard deviations, normalised frame.
 
     ``affine`` is the standard deviation of an affine part, ``least`` the smallest one of the
-    distances between moved points and their targets.
+    distances between moved points and their targets; ``rank`` and ``tolerance`` are those of
+    :func:`~dine.priors.gaussian.fitted_root`.
     """
 
     widths: tuple[float, ...]
@@ -29,14 +30,27 @@ class Smoothness(NamedTuple):
     affine: float
     least: float
     rank: int
+    tolerance: float = 1e-4
+
+    def fitted(self, points: np.ndarray) -> CovarianceRoot:
+        """A root at (N, 3) points, which goes on to others."""
+        return fitted_root(
+            points,
+            self.widths,
+            self.amplitudes,
+            self.affine,
+            rank=self.rank,
+            tolerance=self.tolerance,
+        )
 
     def at(self, points: np.ndarray) -> LinearGaussian:
         """The prior of fields at (N, 3) points."""
-        root = covariance_root(points, self.widths, self.amplitudes, self.affine, rank=self.rank)
-        return LinearGaussian.of_kernel(root)
+        return LinearGaussian.of_kernel(self.fitted(points).root)
 
 
 # Chosen on the validation pairs of both synthetic datasets (60) and on 40 resampled ones of the
 # pretraining data.
 STIFF = Smoothness((1.5, 0.4), (0.2, 0.04), 0.05, 0.01, 128)
 LOOSE = Smoothness((1.5, 0.4, 0.25), (0.5, 0.2, 0.04), 0.5, 0.004, 200)
+# On every second of 23 real shapes with synthetic deformations (benchmarks/surfaces.py).
+SURFACE = Smoothness((1.5, 0.5, 0.25), (0.5, 0.2, 0.04), 0.3, 0.004, 300, 1e-5)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dine.geometry.distance import surface_distance
 from dine.geometry.interpolation import FittedValues
@@ -25,6 +26,8 @@ _RARE = 99.0
 _FOLDED = 0.02
 # Less is within what two draws of points from one surface make of a field.
 _LOWERED = 0.5
+# Object radii; who has not moved farther needs no better.
+_SMALL = 0.01
 # 5 % of the diameter, at which the evaluation calls a point lost.
 _INCONSISTENT = 0.1
 
@@ -77,12 +80,16 @@ def measure(
     source, target = dense_points(pair.source), dense_points(pair.target)
     aligned = surface_distance(pair.alignment.align(source), target, partial=partial)
     after = surface_distance(motion(source), target, partial=partial)
-    checks = {"remaining": _ratio(after["chamfer"], aligned["chamfer"])}
+    # Points alone cannot tell a small motion from where they happened to be drawn.
+    surfaces = settings.surfaces and not partial
+    floor = _spacing(source) + _spacing(target) if surfaces else 0.0
+    checks = {"remaining": _remaining(aligned["chamfer"], after["chamfer"], floor)}
     if correspondence.inconsistency is not None:
         checks["inconsistency"] = correspondence.inconsistency
     if expected is not None:
         moved_by = float(np.linalg.norm(correspondence.field, axis=1).mean())
-        checks["uncertain"] = _ratio(expected.mean, moved_by * pair.alignment.frame.scale)
+        scale = pair.alignment.frame.scale
+        checks["uncertain"] = expected.mean / (max(moved_by, _SMALL) * scale)
     # Where points come in another order than the prior's, it says nothing of their field.
     prior = model.prior if model.convention != "none" else None
     start, field, goal = correspondence.start, correspondence.field, correspondence.goal
@@ -91,8 +98,18 @@ def measure(
     return Measures(before, aligned, after, values, checks)
 
 
-def _ratio(value: float, of: float) -> float:
-    return value / of if of > 0 else 1.0
+def _spacing(points: np.ndarray) -> float:
+    """Mean squared distance of points to their nearest others: what two draws from one surface are
+    apart by."""
+    return float((cKDTree(points).query(points, k=[2])[0] ** 2).mean())
+
+
+def _remaining(before: float, after: float, floor: float) -> float:
+    """What is left of a Chamfer distance above its floor, if it has one; 0 where there was hardly
+    any."""
+    if floor == 0:
+        return after / before if before > 0 else 1.0
+    return max(after - floor, 0.0) / (before - floor) if before > 2 * floor else 0.0
 
 
 _UNLIKE = {
@@ -118,9 +135,10 @@ def assess(
     """Compare values of a result (normalised frame, names as in the calibration) with the rest.
 
     ``checks`` need no validation pairs: ``remaining``, the Chamfer distance that is left, as a
-    share of that before (after rigid alignment); ``uncertain``, the expected error as a share of
-    the displacement, means of both; ``inconsistency``, how far points end up from where they began
-    (mean, normalised) when registered to the target and back.
+    share of that before (after rigid alignment); ``uncertain``, the expected error as a share
+    of the displacement (of a hundredth of the radius at least), means of both;
+    ``inconsistency``, how far points end up from where they began (mean, normalised) when
+    registered to the target and back.
     """
     reasons = [*notes, *_from_checks(checks or {})]
     percentiles: dict[str, float] = {}

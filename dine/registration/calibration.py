@@ -25,8 +25,8 @@ class Calibration:
     """Measured on validation pairs of known correspondence, in the normalised frame.
 
     Attributes:
-        spread: (b,) increasing values of what tells errors apart; see
-            :func:`~dine.registration.correspondence.predict_and_refine`.
+        spread: (b,) increasing values of what tells errors apart, the ``indicator`` of a
+            :class:`~dine.registration.types.Correspondence`.
         error: (b,) mean distance of a point of that spread from its true place.
         likely: (b,) 90th percentile of these distances.
         reference: sorted values over validation pairs by name: ``initial`` and ``final`` Chamfer

@@ -19,10 +19,14 @@ from dine.geometry.surface import Surface
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.refinement.refine import ROUNDS, Observed, Options, refine
 from dine.registration.shapes import FEWEST, drawn
+from dine.registration.surfaces import refined_on_surfaces
 from dine.registration.types import Correspondence, Model, Pair, Settings
 
 # A source point is shown by the target if a target point ends up within so many spacings of it.
 _RETURN = 3.0
+# Points that end so close to each other are the same, and the share of such from which all are.
+_SAME = 1e-9
+_SHARED = 0.5
 
 
 def aligned_pair(source: Surface, target: Surface, settings: Settings, convention: str) -> Pair:
@@ -64,19 +68,32 @@ def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:
     rounds = settings.rounds
     if rounds < 0:
         raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
+    found = _from_points(pair, model, settings)
+    if not (settings.surfaces and rounds):
+        return found
+    # Scans that hold the same points say of each where it went.
+    if (distances(found.moved, pair.goal) < _SAME).mean() >= _SHARED:
+        return replace(found, indicator=np.zeros(len(found.start)))
+    return refined_on_surfaces(pair, found, settings)
+
+
+def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence:
+    """What the drawn points alone say."""
     if settings.partial:
-        return _from_part(pair.start, pair.goal, rounds)
-    there = _whole(model.backbone, pair.start, pair.goal, settings)
+        return _from_part(pair.start, pair.goal, settings.rounds)
+    there = one_way(model.backbone, pair.start, pair.goal, settings)
     # The way back has a frame of its own, in which the target is the source.
     frame = Frame.of(pair.goal)
     seen, whole = frame.normalise(pair.goal), frame.normalise(pair.start)
-    back = _whole(model.backbone, seen, whole, settings).field * frame.scale
+    back = one_way(model.backbone, seen, whole, settings).field * frame.scale
     return replace(there, inconsistency=_inconsistency(there, back))
 
 
-def _whole(
+def one_way(
     backbone: Backbone, start: np.ndarray, goal: np.ndarray, settings: Settings
 ) -> Correspondence:
+    """Where the points ``start`` (N, 3) belong among those of ``goal`` (M, 3), normalised frame,
+    without the check of the way back."""
     field, indicator = predict_and_refine(backbone, start, goal, settings.device, settings.rounds)
     return Correspondence(start, goal, field, indicator, np.ones(len(start), bool))
 

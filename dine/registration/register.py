@@ -11,7 +11,6 @@ import numpy as np
 from dine import __version__
 from dine.files import file_digest
 from dine.geometry.distance import landmark_errors
-from dine.geometry.interpolation import FittedDisplacement
 from dine.models.devices import chosen_device
 from dine.refinement.refine import ROUNDS
 from dine.registration.assessment import Measures, assess, expected_error, measure
@@ -38,6 +37,7 @@ def register(
     apply: Mapping[str, Shape] | None = None,
     landmarks: tuple[np.ndarray, np.ndarray] | None = None,
     rounds: int = ROUNDS,
+    surfaces: bool = False,
     partial: bool = False,
     points: int = POINTS,
     seed: int = 0,
@@ -58,6 +58,8 @@ def register(
         apply: further shapes in the source's frame to move along, by name.
         landmarks: corresponding (L, 3) points of source and target, to measure with only.
         rounds: of refinement at test time (most probable smooth field); 0 for the network's own.
+        surfaces: go on from the points to the surfaces that they were drawn on (meshes), or to all
+            points (clouds); not without rounds. On trial, see docs/guide/register.md.
         partial: the target shows a part of the source only. Regions without counterpart follow the
             others instead of being pulled onto the part.
         points: points that the network sees; it was trained with 1024.
@@ -68,7 +70,7 @@ def register(
         DataError: unreadable or unusable shapes, such as points on a line, or of other sizes.
         ConfigError: unusable settings.
     """
-    settings = Settings(prealign, rounds, partial, points, seed, chosen_device(device))
+    settings = Settings(prealign, rounds, partial, points, seed, chosen_device(device), surfaces)
     return _registered(source, target, model, settings, apply or {}, landmarks)
 
 
@@ -90,7 +92,7 @@ def _registered(
     correspondence = correspond(pair, model, settings)
     notes += _support(correspondence)
 
-    motion = Motion(pair.alignment, FittedDisplacement(pair.start, correspondence.field))
+    motion = Motion(pair.alignment, correspondence.interpolated())
     moved = motion.surface(source)
     displacement = moved.vertices - source.vertices
     calibration = model.calibration_for(settings)

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dine.data.sampling import SurfaceSamples, sample_surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.oriented import evenly
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 
@@ -21,6 +23,12 @@ FEWEST = 16
 _LARGEST_RATIO = 3.0
 # Tissue hardly grows or shrinks that much, but from inches to centimetres it is 2.54.
 _UNUSUAL_RATIO = 1.5
+# Fewer than so many points beside each other belong to nothing.
+_COMPANY = 3
+_APART = 0.5
+_UNUSUAL_GAP = 10.0
+# Points spread evenly for each that is drawn of a cloud.
+_EVENLY = 2
 _UNITS = {1000: "metres and millimetres", 100: "metres and centimetres", 10: "cm and mm"}
 _UNITS |= {25.4: "inches and millimetres", 2.54: "inches and centimetres"}
 
@@ -91,8 +99,9 @@ def check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
 
 
 def _size(surface: Surface, what: str) -> float:
-    middle = surface.vertices.mean(axis=0)
-    size = float(np.linalg.norm(surface.vertices - middle, axis=1).mean())
+    middle = np.median(surface.vertices, axis=0)
+    distance = np.linalg.norm(surface.vertices - middle, axis=1)
+    size = float(np.median(distance) or distance.mean())
     if len(surface.vertices) == 1 or size <= 1e-12 * np.abs(middle).max():
         raise DataError(
             f"All points of {surface.name}, the {what}, coincide; expected the surface of an "
@@ -110,14 +119,6 @@ def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) ->
     """
     if points < FEWEST:
         raise ConfigError(f"The number of points is {points}; expected at least {FEWEST}.")
-    count = points
-    if surface.faces is None:
-        count = min(points, len(np.unique(surface.vertices, axis=0)))
-        if count < FEWEST:
-            raise DataError(
-                f"{surface.name}, the {what}, has {count} distinct points; expected at least "
-                f"{FEWEST}."
-            )
     extent = surface.vertices - surface.vertices.mean(axis=0)
     widths = np.linalg.svd(extent, compute_uv=False)
     if widths[1] <= 1e-6 * widths[0]:
@@ -126,20 +127,38 @@ def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) ->
             "an object."
         )
     if surface.faces is not None:
-        return sample_surface(surface, count, rng)
-    if count == len(surface.vertices):
-        return _vertices(np.arange(count))
+        return sample_surface(surface, points, rng)
     _, first = np.unique(surface.vertices, axis=0, return_index=True)
-    return _vertices(rng.permutation(first)[:count])
-
-
-def _vertices(index: np.ndarray) -> SurfaceSamples:
+    if len(first) < FEWEST:
+        raise DataError(
+            f"{surface.name}, the {what}, has {len(first)} distinct points; expected at least "
+            f"{FEWEST}."
+        )
+    index = np.sort(first[near_points(surface.vertices[first])])
+    if len(index) > points:
+        # Scanners see some regions more densely than others; that says nothing of the object.
+        index = index[evenly(surface.vertices[index], _EVENLY * points)]
+        index = rng.permutation(index)[:points]
     return SurfaceSamples(index[:, None].repeat(3, axis=1), np.tile([1.0, 0, 0], (len(index), 1)))
+
+
+def near_points(points: np.ndarray) -> np.ndarray:
+    """Mask (N,) of the points of a cloud that are not apart from all others, as wrong ones are.
+
+    Apart: the third neighbour is farther than half the median distance from the median point, and
+    than ten times what is usual. Parts of an object are denser than that.
+    """
+    count = len(points)
+    if count <= _COMPANY:
+        return np.ones(count, bool)
+    gap = cKDTree(points).query(points, k=[_COMPANY + 1])[0][:, 0]
+    size = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    return gap <= max(_APART * size, _UNUSUAL_GAP * np.median(gap))
 
 
 def dense_points(surface: Surface) -> np.ndarray:
     """Points to measure distances with: four times as many as the network sees."""
     if surface.faces is None:
-        return surface.vertices
+        return surface.vertices[near_points(surface.vertices)]
     rng = np.random.default_rng(5)
     return sample_surface(surface, 4 * POINTS, rng).places(surface.vertices)

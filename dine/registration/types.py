@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,10 +35,11 @@ class Model:
         return str(self.prior.notes.get("convention", "none")) if self.prior else "none"
 
     def calibration_for(self, settings: Settings) -> Calibration | None:
-        """The calibration where it applies: to whole targets, and its own rounds of refinement."""
+        """The calibration where it applies: to whole targets, refined as it was made with."""
         if self.calibration is None or settings.partial:
             return None
-        return self.calibration if settings.rounds == self.calibration.facts.get("rounds") else None
+        made = (self.calibration.facts.get("rounds"), self.calibration.facts.get("surfaces", False))
+        return self.calibration if made == (settings.rounds, settings.surfaces) else None
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,13 @@ class Settings:
     points: int
     seed: int
     device: torch.device
+    surfaces: bool = False
 
     def described(self, points: int) -> dict[str, Any]:
         """For the report; ``points`` were drawn."""
         return {
             "rounds": self.rounds,
+            "surfaces": self.surfaces,
             "partial": self.partial,
             "points": points,
             "seed": self.seed,
@@ -97,6 +101,8 @@ class Correspondence:
         supported: (N,) bool, points that the target shows.
         inconsistency: mean distance from ``start`` of points registered to the target and back;
             None where that was not tried.
+        anywhere: the field as a function of (M, 3) places, normalised frame; None where it is
+            known at ``start`` only.
     """
 
     start: np.ndarray
@@ -105,6 +111,11 @@ class Correspondence:
     indicator: np.ndarray | None
     supported: np.ndarray
     inconsistency: float | None = None
+    anywhere: Callable[[np.ndarray], np.ndarray] | None = None
+
+    def interpolated(self) -> Callable[[np.ndarray], np.ndarray]:
+        """The field as a function of (M, 3) places, normalised frame."""
+        return self.anywhere or FittedDisplacement(self.start, self.field)
 
     @property
     def moved(self) -> np.ndarray:
@@ -117,7 +128,7 @@ class Motion:
     """Moves any points of the source's coordinates to where they belong, in the target's."""
 
     alignment: Alignment
-    field: FittedDisplacement
+    field: Callable[[np.ndarray], np.ndarray]
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """(V, 3) points, moved."""

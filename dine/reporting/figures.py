@@ -387,6 +387,15 @@ def _bare_axes(axes: Any, limits: list[tuple[float, float]]) -> None:
 # ------------------------------------------------------------------------------- training
 
 
+def _criterion(search: Mapping[str, Any]) -> str:
+    """How a search chose λ."""
+    value = str(search.get("criterion", "cd")).upper()
+    tolerance = float(search.get("tolerance", 0))
+    return (
+        f"largest within {tolerance:.0%} of the lowest {value}" if tolerance else f"lowest {value}"
+    )
+
+
 def search_figure(
     searches: Sequence[Mapping[str, Any]], where: str, origin: str, titles: Mapping[str, str] = {}
 ) -> Figure:
@@ -410,8 +419,8 @@ def search_figure(
     panels = [("lambda", value) for value in VALUES if curve[value].notna().any()]
     if curve["roughness"].notna().any() and curve["mce"].notna().any():
         panels.append(("roughness", "mce"))
-    criteria = {str(search.get("criterion", "cd")).upper() for search in searches}
-    note = f"Validation pairs. Star: chosen λ (lowest {names.join(sorted(criteria))}). "
+    criteria = sorted({_criterion(search) for search in searches})
+    note = f"Validation pairs. Star: chosen λ ({names.join(criteria)}). "
     note += "Dashed: λ = 0, longer training alone."
     figure = new_figure(4.3 * len(panels) + 0.8, 4.2, f"Choice of λ: {where}", origin, note)
     drawn = figure.subplots(1, len(panels), squeeze=False)[0]

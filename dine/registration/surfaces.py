@@ -1,0 +1,114 @@
+"""From points to surfaces: the last stage of a registration, on as much of both as there is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dine.data.sampling import sample_surface
+from dine.geometry.interpolation import within_reach
+from dine.geometry.oriented import (
+    OrientedPoints,
+    evenly,
+    fitted_planes,
+    rim_points,
+    rim_vertices,
+    unit,
+)
+from dine.geometry.surface import Surface
+from dine.priors.gaussian import CovarianceRoot, LinearGaussian, Posterior
+from dine.refinement.process import SURFACE
+from dine.refinement.surface import SurfaceOptions, refine_on_surface
+from dine.registration.shapes import near_points
+from dine.registration.types import Correspondence, Pair, Settings
+
+SOURCE_POINTS = 2000
+TARGET_POINTS = 20_000
+# Drawn for each that is kept, so that what is kept lies evenly.
+_DRAWN = 4
+# Error of a coarse field, which a start that the process allows is fitted to.
+_COARSE_ERROR = 0.01
+# Points through which a plane is laid to see how rough a mesh is, and the cosine between planes and
+# faces below which its faces are not followed: 20 degrees.
+_SMOOTHED = 24
+_NOISY = 0.94
+
+
+@dataclass(frozen=True)
+class ProcessField:
+    """A field of a Gaussian process, given by amplitudes (r, 3) of its root; goes on anywhere.
+
+    Farther than two radii from the object it is what it is there.
+    """
+
+    root: CovarianceRoot
+    amplitudes: np.ndarray
+
+    def __call__(self, places: np.ndarray) -> np.ndarray:
+        """The displacement (M, 3) at places (M, 3), normalised frame."""
+        found = np.empty((len(places), 3))
+        # A kernel of r columns for so many rows at once.
+        for first in range(0, len(places), _ROWS):
+            rows = slice(first, first + _ROWS)
+            found[rows] = self.root.at(within_reach(places[rows])) @ self.amplitudes
+        return found
+
+
+_ROWS = 20_000
+
+
+def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> OrientedPoints:
+    """At most ``count`` points of a surface and its normals there.
+
+    Drawn by area from a mesh; of a cloud those that cover it evenly. The faces of a noisy mesh lie
+    every way; planes through neighbours replace them there.
+    """
+    if surface.faces is None:
+        points = surface.vertices[near_points(surface.vertices)]
+        points = points[evenly(points, count)]
+        normals, _ = fitted_planes(points)
+        return OrientedPoints(points, normals, rim_points(points, normals))
+    samples = sample_surface(surface, count, rng)
+    corners = surface.vertices[samples.faces_vertices]
+    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    points = samples.places(surface.vertices)
+    planes, _ = fitted_planes(points, _SMOOTHED)
+    product = np.einsum("nc,nc->n", planes, normals)
+    if np.median(np.abs(product)) < _NOISY:
+        normals = planes * np.where(product < 0, -1.0, 1.0)[:, None]
+    rim = rim_vertices(surface.faces, len(surface.vertices))[samples.faces_vertices].any(axis=1)
+    return OrientedPoints(points, normals, rim)
+
+
+def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -> Correspondence:
+    """What was found between points, refined between the surfaces that they were drawn on."""
+    rng = np.random.default_rng([7, settings.seed])
+    source, target = (
+        replace(surface, vertices=normalise(surface.vertices))
+        for surface, normalise in (
+            (pair.source, pair.alignment.normalise),
+            (pair.target, pair.alignment.frame.normalise),
+        )
+    )
+    moving = oriented_points(source, _DRAWN * SOURCE_POINTS, rng)
+    moving = moving.at(evenly(moving.points, SOURCE_POINTS))
+    fixed = oriented_points(target, TARGET_POINTS, rng)
+    root = SURFACE.fitted(moving.points)
+    prior = LinearGaussian.of_kernel(root.root)
+    start = ProcessField(root, _fitted(root, found.start, found.field))
+    starts = [start(moving.points), np.zeros_like(moving.points)]
+    options = SurfaceOptions(part=settings.partial)
+    posterior = refine_on_surface(moving, fixed, starts, prior, options)
+    anywhere = ProcessField(root, posterior.alone)
+    deviation = np.sqrt(posterior.variance(root.at(found.start)))
+    if not posterior.alone.any():
+        deviation[:] = 0.0  # nothing moved, which is more probable than any motion
+    return replace(found, field=anywhere(found.start), anywhere=anywhere, indicator=deviation)
+
+
+def _fitted(root: CovarianceRoot, places: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Amplitudes (r, 3) of the most probable field that is nearly ``field`` (N, 3) at places."""
+    precision = 1 / _COARSE_ERROR**2
+    every = np.broadcast_to(precision * np.eye(3), (len(places), 3, 3))
+    return Posterior(LinearGaussian.of_kernel(root.at(places)), precision * field, every).alone

@@ -1,0 +1,109 @@
+"""Refinement against surfaces: on what is known to be the answer, and within registrations."""
+
+import numpy as np
+import pytest
+import trimesh
+from click.testing import CliRunner
+
+import dine
+from dine.cli import cli
+from dine.data.sampling import sample_surface
+from dine.files import read_json
+from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.writers import write_surface
+from dine.registration.surfaces import oriented_points
+
+pytestmark = pytest.mark.numerical
+
+
+def organ(degrees=0.0):
+    """A lopsided closed shape of about unit radius; its vertices lie elsewhere by degrees."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [1, 2, 3])[:3, :3]
+    vertices = np.asarray(ball.vertices) @ turn
+    reach = np.ones(len(vertices))
+    for direction, height, width in (
+        ((1, 0.3, 0.2), 0.9, 0.35), ((-0.4, 1, 0.1), 0.5, 0.3),
+        ((0.1, -0.6, 1), 0.7, 0.25), ((-0.7, -0.5, -0.6), -0.35, 0.5),
+    ):  # fmt: skip
+        along = vertices @ (np.array(direction) / np.linalg.norm(direction))
+        reach += height * np.exp(-(1 - along) / width**2)
+    return Surface(vertices * reach[:, None] * [0.6, 0.5, 0.4], np.asarray(ball.faces))
+
+
+def bent(points):
+    """A smooth motion of some 10 % of the radius."""
+    x, y, z = points.T
+    return points + 0.1 * np.column_stack([np.sin(2 * y), np.cos(2 * z) - 1, np.sin(1.5 * x + 1)])
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A source, and a target of other vertices with the places of the source's on it."""
+    source, other = organ(), organ(50)
+    return source, Surface(bent(other.vertices), other.faces), bent(source.vertices)
+
+
+def mean_error(points, truth):
+    return np.linalg.norm(points - truth, axis=1).mean()
+
+
+def test_normals_of_a_mesh_point_out_of_it():
+    found = oriented_points(organ(), 500, np.random.default_rng(0))
+    assert np.allclose(np.linalg.norm(found.normals, axis=1), 1)
+    assert ((found.normals * found.points).sum(axis=1) > 0).mean() > 0.98
+
+
+def test_the_surface_says_more_than_its_points(pair):
+    source, target, truth = pair
+    coarse = dine.register(source, target, prealign="off")
+    fine = dine.register(source, target, prealign="off", surfaces=True)
+    assert mean_error(fine.moved.vertices, truth) < 0.02
+    assert mean_error(fine.moved.vertices, truth) < 0.5 * mean_error(coarse.moved.vertices, truth)
+    used = [result.report["settings"]["surfaces"] for result in (fine, coarse)]
+    assert used == [True, False]
+
+
+def test_a_mesh_registered_to_itself_stays_where_it_is():
+    source = organ()
+    result = dine.register(source, source, surfaces=True)
+    assert result.report["trust"]["checks"]["remaining"] == 0
+    assert np.linalg.norm(result.displacement, axis=1).mean() < 1e-3
+
+
+def test_clouds_use_all_their_points(pair):
+    source, target, truth = pair
+    rng = np.random.default_rng(0)
+    drawn = sample_surface(target, 6000, rng).places(target.vertices)
+    result = dine.register(source.vertices, drawn, prealign="off", surfaces=True)
+    assert mean_error(result.moved.vertices, truth) < 0.03
+
+
+def test_a_part_of_the_target_pulls_at_what_it_shows_only(pair):
+    source, target, truth = pair
+    shown = target.vertices[target.vertices[:, 0] > -0.1]
+    settings = {"prealign": "off", "partial": True}
+    coarse = dine.register(source, shown, **settings)
+    fine = dine.register(source, shown, **settings, surfaces=True)
+    assert mean_error(fine.moved.vertices, truth) < mean_error(coarse.moved.vertices, truth)
+
+
+def test_scans_that_share_their_points_are_matched_exactly():
+    rng = np.random.default_rng(0)
+    source = sample_surface(organ(), 500, rng).places(organ().vertices)
+    truth = bent(source)
+    shuffled = truth[rng.permutation(500)]
+    result = dine.register(source, shuffled, prealign="off", surfaces=True)
+    assert mean_error(result.moved.vertices, truth) < 1e-3
+
+
+def test_the_command_goes_on_to_the_surfaces_where_asked(pair, tmp_path):
+    for name, surface in zip(("before", "after"), pair, strict=False):
+        write_surface(tmp_path / f"{name}.ply", surface)
+    out = tmp_path / "moved.ply"
+    files = (tmp_path / "before.ply", tmp_path / "after.ply")
+    done = CliRunner().invoke(cli, ["register", *map(str, files), "-o", str(out), "--surfaces"])
+    assert done.exit_code == 0, done.exception
+    assert read_json(out.with_suffix(".json"))["settings"]["surfaces"]
+    assert mean_error(read_surface(out).vertices, pair[2]) < 0.02
