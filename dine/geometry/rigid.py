@@ -15,10 +15,7 @@ from dine.geometry.frame import Frame
 # A rigid motion must lower the mean squared distance this much, or deformations of round objects
 # would pass for rotations; so must starts at other rotations, or symmetric objects would be turned.
 _MUCH_BETTER = 0.5
-_KEPT = 0.75
-_SOME = 300
-_ITERATIONS = 60
-_SETTLED = 1e-5
+_ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
 
 
 def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -86,16 +83,15 @@ def check_rigid(matrix: np.ndarray, name: str = "The given alignment") -> np.nda
 def rigid_alignment(source: np.ndarray, target: np.ndarray, *, partial: bool = False) -> np.ndarray:
     """The 4×4 rigid motion that brings (N, 3) source points onto (M, 3) target points.
 
-    Trimmed iterative closest points, both ways, from where the points are, from coinciding middles,
-    and from coinciding principal axes; the last are taken only if they fit much better, since a
-    symmetric object fits about as well the wrong way round. The identity is kept unless something
-    fits much better. The farthest quarter of the distances counts for nothing, as it may belong to
-    what one of the two lacks (Chetverikov et al., 2005, Image and Vision Computing 23).
+    Iterative closest points (trimesh) from where the points are, from coinciding middles, and from
+    coinciding principal axes; the last are taken only if they fit much better, since a symmetric
+    object fits about as well the wrong way round. The identity is kept unless something fits much
+    better.
 
     With ``partial`` the target is brought onto the source, of which it is a part, and the inverse
     is returned: every point of the part has a counterpart in the whole, but not the other way.
     """
-    # In units of the object, so that nothing depends on those of the file.
+    # In units of the object, or a tolerance would mean something else in metres.
     centre = np.median(source, axis=0)
     size = float(np.median(np.linalg.norm(source - centre, axis=1))) or 1.0
     a, b = ((points - centre) / size for points in (source, target))
@@ -108,62 +104,26 @@ def rigid_alignment(source: np.ndarray, target: np.ndarray, *, partial: bool = F
 
 
 def _best_motion(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray:
-    # Where it ends is found with some of the points, and where exactly with all.
-    some = _Matching(*(x[:: max(1, len(x) // _SOME)] for x in (a, b)), both_ways)
+    tree = cKDTree(b)
+
+    def misfit(matrix: np.ndarray) -> float:
+        moved = transformed(a, matrix)
+        there = float((tree.query(moved)[0] ** 2).mean())
+        return there + float((cKDTree(moved).query(b)[0] ** 2).mean()) if both_ways else there
+
+    def improved(start: np.ndarray) -> tuple[float, np.ndarray]:
+        matrix, _, _ = trimesh.registration.icp(a, b, initial=start, **_ICP)
+        return misfit(matrix), matrix
 
     def best_of(starts: Iterable[np.ndarray]) -> tuple[float, np.ndarray]:
-        return min((some.improved(start) for start in starts), key=lambda result: result[0])
+        return min((improved(start) for start in starts), key=lambda result: result[0])
 
-    best = (some.misfit(np.eye(4)), np.eye(4))
+    best = (misfit(np.eye(4)), np.eye(4))
     near = best_of([np.eye(4), _between_middles(a, b, np.eye(3))])
     if near[0] < _MUCH_BETTER * best[0]:
         best = near
     turned = best_of(_between_middles(a, b, rotation) for rotation in _between_axes(a, b))
-    if turned[0] < _MUCH_BETTER * best[0]:
-        best = turned
-    if (best[1] == np.eye(4)).all():
-        return best[1]
-    return _Matching(a, b, both_ways).improved(best[1])[1]
-
-
-class _Matching:
-    """Nearest points of (N, 3) points a, once moved, and (M, 3) points b; in one or both ways."""
-
-    def __init__(self, a: np.ndarray, b: np.ndarray, both_ways: bool):
-        self.a, self.b, self.both_ways = a, b, both_ways
-        self.tree = cKDTree(b)
-
-    def pairs(self, matrix: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """For each way the distances of the nearest three quarters, and their indices in a, b."""
-        moved = transformed(self.a, matrix)
-        distance, there = self.tree.query(moved)
-        found = [(distance, np.arange(len(moved)), there)]
-        if self.both_ways:
-            distance, back = cKDTree(moved).query(self.b)
-            found.append((distance, back, np.arange(len(self.b))))
-        return [_nearest(*way) for way in found]
-
-    def misfit(self, matrix: np.ndarray) -> float:
-        return sum(float((distance**2).mean()) for distance, _, _ in self.pairs(matrix))
-
-    def improved(self, matrix: np.ndarray) -> tuple[float, np.ndarray]:
-        """The misfit where iterative closest points end, and the motion there."""
-        for _ in range(_ITERATIONS):
-            ways = self.pairs(matrix)
-            ours, theirs = (np.concatenate([way[side] for way in ways]) for side in (1, 2))
-            last = matrix
-            matrix, _, _ = trimesh.registration.procrustes(
-                self.a[ours], self.b[theirs], reflection=False, scale=False
-            )
-            if np.abs(matrix - last).max() < _SETTLED:
-                break
-        return self.misfit(matrix), matrix
-
-
-def _nearest(*columns: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The rows whose first column, a distance, is among the smallest."""
-    kept = np.argsort(columns[0], kind="stable")[: max(3, round(_KEPT * len(columns[0])))]
-    return tuple(column[kept] for column in columns)
+    return turned[1] if turned[0] < _MUCH_BETTER * best[0] else best[1]
 
 
 def _between_middles(a: np.ndarray, b: np.ndarray, rotation: np.ndarray) -> np.ndarray:
