@@ -27,6 +27,7 @@ from dine.refinement.refine import ROUNDS
 from dine.registration.assessment import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 from dine.registration.calibration import Calibration, load_calibration, plausibility
 from dine.registration.model import load_model
+from dine.registration.shapes import near_points
 
 pytestmark = pytest.mark.numerical
 POINTS = 1024
@@ -83,6 +84,39 @@ def test_alignment_finds_a_rigid_motion(degrees):
 def test_alignment_leaves_what_fits_already():
     points = organ().vertices
     assert np.abs(rigid_alignment(points, points) - np.eye(4)).max() < 1e-6
+
+
+@pytest.mark.parametrize("size", [1e4, 1e-4])
+def test_alignment_does_not_depend_on_units(size):
+    points = organ().vertices
+    target = transformed(bump(points), turned(25))
+    known, found = (rigid_alignment(s * points[::3], s * target[1::3]) for s in (1, size))
+    assert np.allclose(found[:3, :3], known[:3, :3], atol=1e-6)
+    assert np.allclose(found[:3, 3], size * known[:3, 3], atol=1e-6 * size)
+
+
+def test_points_apart_from_all_others_are_told_from_an_object():
+    rng = np.random.default_rng(0)
+    cloud = organ().vertices
+    stray = np.array([[5.0, 1, 1], [5.1, 1, 1], [-90, 0, 0]])
+    assert near_points(np.concatenate([cloud, stray])).tolist() == [True] * len(cloud) + [False] * 3
+    # Whatever its density, and however few points it has.
+    dense = np.concatenate([cloud, 0.02 * rng.normal(size=(5000, 3)) + cloud[0]])
+    assert near_points(dense).all()
+    assert near_points(rng.normal(size=(16, 3))).all()
+    assert near_points(np.zeros((3, 3))).all()
+
+
+def test_a_single_far_point_changes_nothing(pair):
+    source, target = (surface.vertices for surface in pair)
+    far = np.array([[100.0, 20, -30]])
+    known = dine.register(source, target, points=POINTS)
+    for clouds in (
+        (np.concatenate([source, far]), target),
+        (source, np.concatenate([target, far])),
+    ):
+        found = dine.register(*clouds, points=POINTS)
+        assert np.allclose(found.moved.vertices[: len(source)], known.moved.vertices)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ _LARGEST_RATIO = 3.0
 _UNUSUAL_RATIO = 1.5
 # Fewer than so many points beside each other belong to nothing.
 _COMPANY = 3
-_APART = 0.5
+_APART = 0.25
 _UNUSUAL_GAP = 10.0
 # Points spread evenly for each that is drawn of a cloud.
 _EVENLY = 2
@@ -145,14 +145,15 @@ def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) ->
 def near_points(points: np.ndarray) -> np.ndarray:
     """Mask (N,) of the points of a cloud that are not apart from all others, as wrong ones are.
 
-    Apart: the third neighbour is farther than half the median distance from the median point, and
-    than ten times what is usual. Parts of an object are denser than that.
+    Apart: the third neighbour is farther than a quarter of the distance from the median point that
+    19 of 20 points have, and than ten times what is usual. Parts of an object are denser than that.
     """
     count = len(points)
     if count <= _COMPANY:
         return np.ones(count, bool)
     gap = cKDTree(points).query(points, k=[_COMPANY + 1])[0][:, 0]
-    size = np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1))
+    distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    size = np.quantile(distance, 0.95, method="lower")
     return gap <= max(_APART * size, _UNUSUAL_GAP * np.median(gap))
 
 

@@ -63,7 +63,7 @@ SETTINGS = {
     # Fields of the training split are predictions, too.
     "pairs per prediction": (
         ("evaluation", "batch_size"),
-        2,
+        3,
         ALL - Counter(stage1=1, stage2_control=1),
     ),
     "one more noise level": (
