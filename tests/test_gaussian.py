@@ -9,7 +9,6 @@ from dine.priors.gaussian import (
     LinearGaussian,
     Posterior,
     covariance_root,
-    fitted_root,
     squared_exponential,
 )
 
@@ -36,11 +35,11 @@ def test_kernel_is_the_naive_formula():
 def test_root_reconstructs_the_kernel():
     points = cloud(60)
     full = squared_exponential(points, points, WIDTHS, AMPLITUDES, AFFINE)
-    exact = covariance_root(points, WIDTHS, AMPLITUDES, AFFINE, tolerance=0)
+    exact = covariance_root(points, WIDTHS, AMPLITUDES, AFFINE, tolerance=0).root
     assert exact.shape == (60, 60)
     assert np.allclose(exact @ exact.T, full, atol=1e-12)
     for tolerance in (1e-2, 1e-4):
-        root = covariance_root(points, WIDTHS, AMPLITUDES, AFFINE, tolerance=tolerance)
+        root = covariance_root(points, WIDTHS, AMPLITUDES, AFFINE, tolerance=tolerance).root
         left = np.diag(full - root @ root.T)
         assert root.shape[1] < 60
         # What is left of the diagonal bounds every other entry that is left.
@@ -50,15 +49,15 @@ def test_root_reconstructs_the_kernel():
 
 def test_root_keeps_to_its_rank_and_to_coinciding_points():
     points = np.repeat(cloud(10), 3, axis=0)
-    assert covariance_root(points, WIDTHS, AMPLITUDES, rank=7).shape == (30, 7)
-    root = covariance_root(points, WIDTHS, AMPLITUDES, rank=30, tolerance=1e-10)
+    assert covariance_root(points, WIDTHS, AMPLITUDES, rank=7).root.shape == (30, 7)
+    root = covariance_root(points, WIDTHS, AMPLITUDES, rank=30, tolerance=1e-10).root
     assert root.shape[1] == 10
     full = squared_exponential(points, points, WIDTHS, AMPLITUDES)
     assert np.allclose(root @ root.T, full, atol=1e-9)
 
 
 def test_an_affine_kernel_has_four_directions():
-    root = covariance_root(cloud(50), (), (), 0.7, tolerance=1e-9)
+    root = covariance_root(cloud(50), (), (), 0.7, tolerance=1e-9).root
     assert root.shape == (50, 4)
 
 
@@ -71,7 +70,7 @@ def test_a_kernel_alone_is_a_model_without_modes():
 
 def test_a_root_goes_on_as_the_process_does():
     points, others = cloud(40), cloud(15, seed=1)
-    fitted = fitted_root(points, WIDTHS, AMPLITUDES, AFFINE, rank=40, tolerance=0)
+    fitted = covariance_root(points, WIDTHS, AMPLITUDES, AFFINE, rank=40, tolerance=0)
     assert np.allclose(fitted.at(points), fitted.root, atol=1e-7)
     # All points are pivots, so that the covariance with them is exact.
     expected = squared_exponential(others, points, WIDTHS, AMPLITUDES, AFFINE)

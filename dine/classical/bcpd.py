@@ -128,7 +128,9 @@ class _State:
     def __init__(self, y: np.ndarray, x: np.ndarray, options: Options):
         self.y, self.x, self.options = y, x, options
         count, self.dim = y.shape
-        self.root = covariance_root(y, (options.beta,), (1.0,), rank=options.rank, tolerance=1e-6)
+        self.root = covariance_root(
+            y, (options.beta,), (1.0,), rank=options.rank, tolerance=1e-6
+        ).root
         self.tree = cKDTree(x)
         # A box a little larger than the target, since points on its faces would cost nothing.
         volume = float(np.prod(np.ptp(x, axis=0) * (len(x) + 1) / len(x)))

@@ -85,19 +85,6 @@ def covariance_root(
     *,
     rank: int = 128,
     tolerance: float = 1e-4,
-) -> np.ndarray:
-    """The (N, r) root of :func:`fitted_root`."""
-    return fitted_root(points, widths, amplitudes, affine, rank=rank, tolerance=tolerance).root
-
-
-def fitted_root(
-    points: np.ndarray,
-    widths: Sequence[float],
-    amplitudes: Sequence[float],
-    affine: float = 0.0,
-    *,
-    rank: int = 128,
-    tolerance: float = 1e-4,
 ) -> CovarianceRoot:
     """A root of :func:`squared_exponential` at points (N, 3).
 

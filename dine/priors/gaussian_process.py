@@ -144,7 +144,10 @@ class GaussianProcessPrior(Prior):
         points = np.asarray(points, dtype=np.float64)
         widths, rank = self.shape["widths"], self.shape["rank"]
         amplitudes, affine, noise = self.scales()
-        root = covariance_root(points, widths, amplitudes, affine, rank=rank, tolerance=_TOLERANCE)
+        fitted = covariance_root(
+            points, widths, amplitudes, affine, rank=rank, tolerance=_TOLERANCE
+        )
+        root = fitted.root
         variance = affine**2 * ((points**2).sum(axis=1) + 1) + float(np.square(amplitudes).sum())
         left_out = np.maximum(variance - np.square(root).sum(axis=1), 0)
         return Factor.of_root(root, np.sqrt(left_out + noise**2)[:, None], like)
@@ -211,7 +214,7 @@ class GaussianProcessPrior(Prior):
         return LinearGaussian.of_kernel(
             covariance_root(
                 source, self.shape["widths"], amplitudes, affine, rank=self.shape["rank"]
-            )
+            ).root
         )
 
 

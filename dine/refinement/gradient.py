@@ -149,7 +149,7 @@ def _smoothing(source: np.ndarray, like: Tensor) -> Callable[[Tensor], Tensor]:
 
     A symmetric positive definite map, so that steps still lead downwards.
     """
-    root = torch.from_numpy(covariance_root(source, (_WIDTH,), (1.0,))).to(like)
+    root = torch.from_numpy(covariance_root(source, (_WIDTH,), (1.0,)).root).to(like)
     # As many points as one point's smoothed gradient is summed over, on average.
     share = (1 - _ROUGH) * len(root) / root.sum(0).square().sum()
     return lambda gradient: _ROUGH * gradient + share * (root @ (root.T @ gradient))

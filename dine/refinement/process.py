@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dine.priors.gaussian import CovarianceRoot, LinearGaussian, fitted_root
+from dine.priors.gaussian import CovarianceRoot, LinearGaussian, covariance_root
 
 OUTLIERS = 0.1
 """Share of the target points that lie anywhere, and not near a moved source point."""
@@ -22,7 +22,7 @@ class Smoothness(NamedTuple):
 
     ``affine`` is the standard deviation of an affine part, ``least`` the smallest one of the
     distances between moved points and their targets; ``rank`` and ``tolerance`` are those of
-    :func:`~dine.priors.gaussian.fitted_root`.
+    :func:`~dine.priors.gaussian.covariance_root`.
     """
 
     widths: tuple[float, ...]
@@ -34,7 +34,7 @@ class Smoothness(NamedTuple):
 
     def fitted(self, points: np.ndarray) -> CovarianceRoot:
         """A root at (N, 3) points, which goes on to others."""
-        return fitted_root(
+        return covariance_root(
             points,
             self.widths,
             self.amplitudes,
