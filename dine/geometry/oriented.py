@@ -36,6 +36,22 @@ class OrientedPoints(NamedTuple):
         return OrientedPoints(self.points[index], self.normals[index], self.rim[index])
 
 
+class Curve(NamedTuple):
+    """Points of a curve, such as where a surface ends.
+
+    Attributes:
+        points: (E, 3).
+        tangents: (E, 3) unit vectors along the curve, of either sign.
+    """
+
+    points: np.ndarray
+    tangents: np.ndarray
+
+    def at(self, index: np.ndarray) -> Curve:
+        """Some of them, by index or mask."""
+        return Curve(self.points[index], self.tangents[index])
+
+
 def unit(vectors: np.ndarray) -> np.ndarray:
     """(N, 3) vectors at length 1; those without length stay as they are."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -81,14 +97,23 @@ def _nearest(points: np.ndarray, count: int) -> np.ndarray:
     return cKDTree(points).query(points, k=[*range(1, count + 1)])[1]
 
 
-def rim_vertices(faces: np.ndarray, count: int) -> np.ndarray:
-    """Mask (count,) of the vertices on edges that only one of the faces (F, 3) has."""
+def rim_edges(faces: np.ndarray, count: int) -> np.ndarray:
+    """(B, 2) vertices, of ``count``, of the edges that only one of the faces (F, 3) has."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     key, times = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
-    single = key[times == 1]
-    rim = np.zeros(count, bool)
-    rim[single // count] = rim[single % count] = True
-    return rim
+    return np.column_stack(np.divmod(key[times == 1], count))
+
+
+def rim_curve(vertices: np.ndarray, edges: np.ndarray, spacing: float) -> Curve:
+    """Points on edges (B, 2) between vertices (V, 3), one for each ``spacing`` of their length."""
+    first = vertices[edges[:, 0]]
+    along = vertices[edges[:, 1]] - first
+    length = np.linalg.norm(along, axis=1)
+    ends = np.cumsum(length)
+    place = np.arange(spacing / 2, ends[-1] if len(ends) else 0.0, spacing)
+    edge = np.searchsorted(ends, place)
+    share = (place - ends[edge] + length[edge]) / length[edge]
+    return Curve(first[edge] + share[:, None] * along[edge], unit(along[edge]))
 
 
 def evenly(points: np.ndarray, count: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -156,6 +157,19 @@ class Posterior:
             self.mean += np.tensordot(self.shared, modes, axes=1)
         self.energy = 0.5 * float((found**2).sum())
         self.complexity = float(np.log(np.diag(self._factor[0])).sum())
+
+    @cached_property
+    def scale(self) -> float:
+        """Standard deviation, in those of the prior, that amplitudes like these are most likely of.
+
+        Squared, it is Σ amplitude² over the number of amplitudes that the data determine (MacKay,
+        1992, Bayesian interpolation, equation 4.9).
+        """
+        inverse = solve_triangular(
+            self._factor[0], np.eye(len(self._factor[0])), lower=True, check_finite=False
+        )
+        determined = len(inverse) - float((inverse**2).sum())
+        return float(np.sqrt(2 * self.energy / max(determined, 1.0)))
 
     def variance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
         """Sum (M,) of the field's three variances where the prior has these rows of its kernel

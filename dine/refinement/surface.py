@@ -16,14 +16,22 @@ symmetric objective function for ICP). All lengths are in the normalised frame.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
-from dine.geometry.oriented import MovingNormals, OrientedPoints, fitted_planes, unit
+from dine.geometry.oriented import (
+    Curve,
+    MovingNormals,
+    OrientedPoints,
+    evenly,
+    fitted_planes,
+    unit,
+)
 from dine.priors.gaussian import LinearGaussian, Posterior
 
 
@@ -32,101 +40,161 @@ class SurfaceOptions:
     """How to refine against a surface.
 
     Attributes:
-        rounds: of matching and solving.
-        first: standard deviation of the distance across the surface in the first round.
-        last: the same in the last round, or the roughness of the target where that is more; it
+        firsts: standard deviations of the distance across the surface that the search begins with,
+            from every start.
+        between: the same where the most probable of the fields found so far is taken.
+        last: the same at the end, or the roughness of the target where that is more.
+        rounds: of matching and solving, as many for each part of the search; the standard deviation
             falls geometrically.
         along: precision of a match along the surface. It only damps: more holds slides up, and
             random places of the drawn points show in the field.
         reach: distance, in standard deviations, at which the weight has fallen to a quarter.
         steepest: largest angle between the normals of a match, in degrees.
         turning: half the distance, in standard deviations, that counts as much as opposite normals.
-        seen: how many target points look for source points, at most.
         part: the target shows a part of the source; its points then look for source points, but not
-            the other way.
+            the other way, and surfaces end anywhere.
     """
 
-    rounds: int = 40
-    first: float = 0.08
+    firsts: tuple[float, ...] = (0.08, 0.2)
+    between: float = 0.03
     last: float = 0.004
+    rounds: int = 20
     along: float = 1.0
     reach: float = 3.0
     steepest: float = 70.0
     turning: float = 2.0
-    seen: int = 8000
     part: bool = False
 
 
 DEFAULTS = SurfaceOptions()
+# Points of the source, of the target, and of the latter those that look for the source, and columns
+# of the prior's kernel, while several fields are tried, and how many look where one is.
+_FEWER = 1000, 5000, 2000, 150
+_LOOKING = 8000
 # Share of the clear matches whose normals agree from which signs are known.
 _ONE_SIDED = 0.9
 
 
+class Outline(NamedTuple):
+    """A surface and where it ends.
+
+    Attributes:
+        surface: (N, 3) points of it.
+        rim: (E, 3) points of the curve that it ends at; E may be 0.
+    """
+
+    surface: OrientedPoints
+    rim: Curve
+
+    @property
+    def places(self) -> np.ndarray:
+        """(N + E, 3), all of them."""
+        return np.vstack([self.surface.points, self.rim.points])
+
+
 def refine_on_surface(
-    source: OrientedPoints,
-    target: OrientedPoints,
+    source: Outline,
+    target: Outline,
     starts: Sequence[np.ndarray],
     prior: LinearGaussian,
     options: SurfaceOptions = DEFAULTS,
 ) -> Posterior:
     """The field after some rounds, as the posterior of the last one.
 
-    From every start the first half of the rounds; the most probable of the fields there goes on.
-    Where the matches are more probable if nothing but the prior's mean happened, that is kept: what
-    is left then follows from where points happened to be drawn.
+    Fields are found from every start, and with every first standard deviation, on fewer points; the
+    most probable of them goes on on all. Where the matches are more probable if nothing but the
+    prior's mean happened, that is kept: what is left then follows from where points happened to be
+    drawn.
 
     Args:
-        source: (N, 3) points, spread evenly.
-        target: (M, 3) points, as many as there are time for.
-        starts: fields (N, 3) to start from.
-        prior: of fields at the source points.
+        source: points spread evenly.
+        target: points, as many as there are time for.
+        starts: fields (N + E, 3) to start from, at the source's places.
+        prior: of fields there.
         options: how many rounds, and of what.
     """
-    search = _Search(source, target, options)
-    search.tell_sides(starts[0])
     # Neither noise nor what planes through neighbours miss of a curved surface is to be followed.
-    rough = float(np.median(fitted_planes(target.points)[1]))
-    last = min(max(options.last, rough), options.first)
-    schedule = np.geomspace(options.first, last, options.rounds)
-    half = len(schedule) // 2 if len(starts) > 1 else 0
-
-    def after(field: np.ndarray, deviations: np.ndarray) -> Posterior:
-        for deviation in deviations:
-            posterior = Posterior(prior, *search.observed(field, deviation)[:2])
-            field = posterior.mean
-        return posterior
-
-    def improbability(posterior: Posterior) -> float:
-        return search.observed(posterior.mean, schedule[half])[2] + posterior.energy
-
+    rough = float(np.median(fitted_planes(target.surface.points)[1]))
+    last = max(options.last, rough)
+    between = max(options.between, last)
+    search = _Search(source, target, options, _LOOKING)
+    search.tell_sides(starts[0])
     # Small systems, for which many threads only wait for each other.
     with threadpool_limits(1, user_api="blas"):
-        if half:
-            starts = [min((after(x, schedule[:half]) for x in starts), key=improbability).mean]
-        end = after(starts[0], schedule[half:])
-        _, precision, misfit = search.observed(prior.mean, schedule[-1])
-        if misfit < search.observed(end.mean, schedule[-1])[2] + end.energy + end.complexity:
+        fields = _fields(search, source, target, starts, prior, between)
+        start = min(fields, key=lambda found: found[1] + search.observed(found[0], between)[2])[0]
+        end = search.posterior(start, prior, np.geomspace(between, last, options.rounds))
+        _, precision, misfit = search.observed(prior.mean, last)
+        if misfit < search.observed(end.mean, last)[2] + end.energy + end.complexity:
             still = np.einsum("nab,nb->na", precision, prior.mean)
             return Posterior(prior, still, precision)
         return end
 
 
+def _fields(
+    search: _Search,
+    source: Outline,
+    target: Outline,
+    starts: Sequence[np.ndarray],
+    prior: LinearGaussian,
+    between: float,
+) -> Iterator[tuple[np.ndarray, float]]:
+    """Fields (N + E, 3) down to some standard deviation, on fewer points, and their energies."""
+    points, fixed, looking, rank = _FEWER
+    count = len(source.surface.points)
+    inside = evenly(source.surface.points, points)
+    rim = np.arange(0, len(source.rim.points), 2)
+    few = _Search(
+        Outline(source.surface.at(inside), source.rim.at(rim)),
+        Outline(target.surface.at(spread(len(target.surface.points), fixed)), target.rim),
+        search.options,
+        looking,
+    )
+    few.signs = search.signs
+    rows = np.concatenate([inside, count + rim])
+    # A pivoted root's first columns are a root of lower rank.
+    less = LinearGaussian(prior.mean[rows], prior.modes[:, rows], prior.kernel[rows, :rank])
+    for first in search.options.firsts:
+        schedule = np.geomspace(max(first, between), between, search.options.rounds)
+        for start in starts:
+            found = few.posterior(start[rows], less, schedule)
+            field = prior.mean + prior.kernel[:, :rank] @ found.alone
+            field += np.tensordot(found.shared, prior.modes, axes=1)
+            yield field, found.energy
+
+
+def spread(count: int, some: int) -> np.ndarray:
+    """At most ``some`` of the indices below ``count``, the same ones each time."""
+    if count <= some:
+        return np.arange(count)
+    return np.random.default_rng(6).permutation(count)[:some]
+
+
 class _Search:
     """Finds what the target says of a field's points."""
 
-    def __init__(self, source: OrientedPoints, target: OrientedPoints, options: SurfaceOptions):
-        self.source, self.target, self.options = source, target, options
-        self.normals = MovingNormals(source)
+    def __init__(self, source: Outline, target: Outline, options: SurfaceOptions, looking: int):
+        """At most ``looking`` target points look for the source."""
+        self.source, self.target, self.options = source.surface, target.surface, options
+        self.rims = _Rims(source.rim, target.rim, options)
+        self.normals = MovingNormals(self.source)
         self.least = np.cos(np.radians(options.steepest))
-        count = len(target.points)
-        self.asking = np.arange(count)
-        if count > options.seen:
-            self.asking = np.random.default_rng(6).permutation(count)[: options.seen]
+        self.asking = spread(len(self.target.points), looking)
+        self.spacings = (2 * _spacing(self.target.points), _spacing(self.source.points))
         self.signs = (1.0, -1.0)
+
+    def posterior(
+        self, field: np.ndarray, prior: LinearGaussian, schedule: np.ndarray
+    ) -> Posterior:
+        """From a field (N + E, 3), the last posterior of a schedule of standard deviations."""
+        for deviation in schedule:
+            posterior = Posterior(prior, *self.observed(field, deviation)[:2])
+            field = posterior.mean
+        return posterior
 
     def tell_sides(self, field: np.ndarray) -> None:
         """Find out, where a field (N, 3) brings the source, which normals are the same side's."""
-        moved = self.source.points + field
+        moved = self.source.points + field[: len(self.source.points)]
         nearest = cKDTree(self.target.points).query(moved)[1]
         product = np.einsum("nc,nc->n", self.normals(moved), self.target.normals[nearest])
         clear = np.abs(product) > self.least
@@ -137,9 +205,19 @@ class _Search:
             self.signs = (-1.0,)
 
     def observed(self, field: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """For each source point the sums of precision · displacement (N, 3) and of precisions
-        (N, 3, 3) over its matches, and how badly the field (N, 3) explains these: −log of their
-        density up to a constant."""
+        """For each source place the sums of precision · displacement (N + E, 3) and of precisions
+        (N + E, 3, 3) over its matches, and how badly the field (N + E, 3) explains these: −log of
+        their density up to a constant."""
+        count = len(self.source.points)
+        inside = self._on_surface(field[:count], deviation)
+        rim = self.rims.observed(field[count:], deviation)
+        pulled, precision = (np.concatenate(both) for both in zip(inside[:2], rim[:2], strict=True))
+        return pulled, precision, inside[2] + rim[2]
+
+    def _on_surface(
+        self, field: np.ndarray, deviation: float
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """The same of points (N, 3) inside the surface."""
         options = self.options
         moved = self.source.points + field
         count = len(moved)
@@ -157,7 +235,12 @@ class _Search:
         # As much weight for the target's points as for the source's.
         scale = np.ones(len(index))
         scale[count:] = count / len(self.asking)
-        squared = (offset**2).sum(axis=1) / (options.reach * deviation) ** 2
+        across = np.einsum("nc,nc->n", normal, offset)
+        beside = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0))
+        # The nearest drawn point is not where it might be drawn.
+        for rows, spacing in zip((slice(count), slice(count, None)), self.spacings, strict=True):
+            beside[rows] = np.maximum(beside[rows] - spacing, 0)
+        squared = (across**2 + beside**2) / (options.reach * deviation) ** 2
         unexplained = np.where(agreeing, squared / (1 + squared), 1.0)
         misfit = 0.5 * options.reach**2 * float((scale * unexplained).sum())
 
@@ -198,3 +281,43 @@ class _Search:
             np.where(nearer if a.ndim == 1 else nearer[:, None], a, b)
             for a, b in zip(first[1:], second[1:], strict=True)
         )
+
+
+def _spacing(points: np.ndarray) -> float:
+    """Median distance to the nearest other point."""
+    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
+
+
+class _Rims:
+    """Finds what the end of the target's surface says of the end of the source's.
+
+    A rim is to lie on a rim, wherever along it. Both must be nearest to each other, roughly: the
+    edge of a hole in one scan then finds nothing in the other.
+    """
+
+    def __init__(self, source: Curve, target: Curve, options: SurfaceOptions):
+        self.source, self.target, self.options = source, target, options
+        self.tree = cKDTree(target.points)
+        none = options.part or not len(target.points) or not len(source.points)
+        self.off = none
+
+    def observed(self, field: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """As of :class:`_Search`, at the rim's points (E, 3)."""
+        count = len(field)
+        if self.off:
+            return np.zeros((count, 3)), np.zeros((count, 3, 3)), 0.0
+        options = self.options
+        moved = self.source.points + field
+        away, to = self.tree.query(moved)
+        back = cKDTree(moved).query(self.target.points[to])[0]
+        squared = away**2 / (options.reach * deviation) ** 2
+        known = away <= 2 * back + deviation
+        unexplained = np.where(known, squared / (1 + squared), 1.0)
+        misfit = 0.5 * options.reach**2 * float(unexplained.sum())
+        weight = known / (1 + squared) ** 2
+        tangent = self.target.tangents[to]
+        along = weight * (options.along - deviation**-2)
+        precision = along[:, None, None] * tangent[:, :, None] * tangent[:, None, :]
+        precision += (weight / deviation**2)[:, None, None] * np.eye(3)
+        wanted = self.target.points[to] - self.source.points
+        return np.einsum("nab,nb->na", precision, wanted), precision, misfit

@@ -5,21 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dine.data.sampling import sample_surface
 from dine.geometry.interpolation import within_reach
 from dine.geometry.oriented import (
+    Curve,
     OrientedPoints,
     evenly,
     fitted_planes,
+    rim_curve,
+    rim_edges,
     rim_points,
-    rim_vertices,
     unit,
 )
 from dine.geometry.surface import Surface
 from dine.priors.gaussian import CovarianceRoot, LinearGaussian, Posterior
 from dine.refinement.process import SURFACE
-from dine.refinement.surface import SurfaceOptions, refine_on_surface
+from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
 from dine.registration.shapes import near_points
 from dine.registration.types import Correspondence, Pair, Settings
 
@@ -77,8 +80,16 @@ def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> O
     product = np.einsum("nc,nc->n", planes, normals)
     if np.median(np.abs(product)) < _NOISY:
         normals = planes * np.where(product < 0, -1.0, 1.0)[:, None]
-    rim = rim_vertices(surface.faces, len(surface.vertices))[samples.faces_vertices].any(axis=1)
+    ends = np.zeros(len(surface.vertices), bool)
+    ends[rim_edges(surface.faces, len(ends))] = True
+    rim = ends[samples.faces_vertices].any(axis=1)
     return OrientedPoints(points, normals, rim)
+
+
+def rim_of(surface: Surface, spacing: float) -> Curve:
+    """Where a mesh ends, a point for each ``spacing`` of its length; no points of a cloud."""
+    faces = np.zeros((0, 3), int) if surface.faces is None else surface.faces
+    return rim_curve(surface.vertices, rim_edges(faces, len(surface.vertices)), spacing)
 
 
 def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -> Correspondence:
@@ -91,19 +102,20 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
             (pair.target, pair.alignment.frame.normalise),
         )
     )
-    moving = oriented_points(source, _DRAWN * SOURCE_POINTS, rng)
-    moving = moving.at(evenly(moving.points, SOURCE_POINTS))
-    fixed = oriented_points(target, TARGET_POINTS, rng)
-    root = SURFACE.fitted(moving.points)
+    drawn = oriented_points(source, _DRAWN * SOURCE_POINTS, rng)
+    drawn = drawn.at(evenly(drawn.points, SOURCE_POINTS))
+    spacing = float(np.median(cKDTree(drawn.points).query(drawn.points, k=2)[0][:, 1]))
+    moving = Outline(drawn, rim_of(source, spacing))
+    fixed = Outline(oriented_points(target, TARGET_POINTS, rng), rim_of(target, spacing / 4))
+    root = SURFACE.fitted(moving.places)
     prior = LinearGaussian.of_kernel(root.root)
     start = ProcessField(root, _fitted(root, found.start, found.field))
-    starts = [start(moving.points), np.zeros_like(moving.points)]
+    starts = [start(moving.places), np.zeros_like(moving.places)]
     options = SurfaceOptions(part=settings.partial)
     posterior = refine_on_surface(moving, fixed, starts, prior, options)
     anywhere = ProcessField(root, posterior.alone)
-    deviation = np.sqrt(posterior.variance(root.at(found.start)))
-    if not posterior.alone.any():
-        deviation[:] = 0.0  # nothing moved, which is more probable than any motion
+    # What the surfaces leave open, the larger the more moved: none of it if nothing did.
+    deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
     return replace(found, field=anywhere(found.start), anywhere=anywhere, indicator=deviation)
 
 
