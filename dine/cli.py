@@ -352,16 +352,8 @@ def stage1(pairs, backbone, settings, seed, compute, name, out):
     from dine.training import stages
 
     _start_torch()
-    stages.stage1(
-        pairs,
-        backbone.kind,
-        backbone.arguments,
-        settings,
-        seed=seed,
-        out=out,
-        name=name or f"stage 1 {backbone.kind}",
-        compute=compute,
-    )
+    order = stages.Order(seed, out, name or f"stage 1 {backbone.kind}", compute)
+    stages.stage1(pairs, backbone, settings, order)
 
 
 @cli.command()
@@ -380,16 +372,8 @@ def pretrain(pairs, targets, backbone, settings, seed, compute, out):
     from dine.training import stages
 
     _start_torch()
-    stages.pretrain(
-        list(pairs),
-        backbone.kind,
-        backbone.arguments,
-        settings,
-        seed=seed,
-        out=out,
-        targets=list(targets),
-        compute=compute,
-    )
+    order = stages.Order(seed, out, f"pretraining/{backbone.kind}", compute)
+    stages.pretrain(list(pairs), backbone, settings, order, list(targets))
 
 
 @cli.command()
@@ -463,9 +447,11 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute
     pca.safetensors --out lambda.json
     """
     from dine.training.stage2 import search_lambda as run
+    from dine.training.stages import Order
 
     _start_torch()
-    run(pairs, model, dict(priors), stage2_settings, settings, seed=seed, out=out, compute=compute)
+    order = Order(seed, out, "search of λ", compute)
+    run(pairs, model, dict(priors), stage2_settings, settings, order)
 
 
 @cli.command()
@@ -489,6 +475,7 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, 
     """
     from dine.training.stage2 import selected_lambda
     from dine.training.stage2 import stage2 as run
+    from dine.training.stages import Order
 
     _start_torch()
     if prior is None:
@@ -500,18 +487,8 @@ def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, 
             value = float(weight)
         except ValueError:
             value = selected_lambda(Path(weight), variant)
-    run(
-        pairs,
-        model,
-        settings,
-        variant=variant,
-        prior=prior,
-        weight=value,
-        seed=seed,
-        out=out,
-        name=name or f"stage 2 {variant}",
-        compute=compute,
-    )
+    order = Order(seed, out, name or f"stage 2 {variant}", compute)
+    run(pairs, model, settings, order, variant=variant, prior=prior, weight=value)
 
 
 # --- evaluation and reporting ---------------------------------------------------------------------
@@ -560,6 +537,7 @@ def evaluate(predictions, pairs, variants, dataset, backbone, methods, seed, poi
     Example: dine evaluate --predictions predictions.h5 --pairs pairs.h5 --dataset mine
     --backbone robust_defreg --method stage1 --point-errors errors.h5 --out metrics.csv
     """
+    from dine.evaluation.metrics import Labels
     from dine.evaluation.metrics import evaluate as run
 
     if len(set(methods)) != len(predictions):
@@ -572,9 +550,7 @@ def evaluate(predictions, pairs, variants, dataset, backbone, methods, seed, poi
         list(variants),
         out,
         point_errors,
-        dataset=dataset,
-        backbone=backbone,
-        seed=seed,
+        labels=Labels(dataset, backbone, seed),
     )
 
 
