@@ -27,7 +27,7 @@ import yaml
 from samples import make_pairs
 
 from dine import config
-from dine.cli import _alignment
+from dine.cli.registration import _alignment
 from dine.data import pairs as pairs_module
 from dine.data.corruption import make_variant
 from dine.data.dataverse import Fetching, download
