@@ -185,7 +185,7 @@ class BCPD(Classical):
         self.tolerance = _positive("tolerance", tolerance)
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return bcpd.bcpd(source, target, bcpd.Options(**vars(self))).moved
+        return bcpd.bcpd(source, target, bcpd.Parameters(**vars(self))).moved
 
 
 @CLASSICAL.register("smooth")

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from dine import config
-from dine.cli.options import IN, Settings, out_option
+from dine.cli.options import IN, SectionType, out_option
 from dine.files import write_text
 
 
@@ -50,7 +50,7 @@ def config_schema():
 
 
 @config_group.command("write")
-@click.argument("settings", type=Settings(config.Config))
+@click.argument("settings", type=SectionType(config.Config))
 @out_option("YAML to write.")
 def config_write(settings: config.Config, out: Path):
     """Write a complete configuration, given as JSON or @FILE, as YAML.

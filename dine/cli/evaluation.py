@@ -8,7 +8,7 @@ from dine import config
 from dine.cli.options import (
     IN,
     OUT,
-    Settings,
+    SectionType,
     batch_option,
     compute_options,
     gathered,
@@ -92,7 +92,7 @@ def evaluate(predictions, pairs, variants, methods, labels, point_errors, out):
 @click.option("--predictions", type=IN, required=True, help="Of `dine predict`.")
 @pairs_option
 @variants_option
-@click.option("--settings", type=Settings(config.RefinedMethod), default='{"kind": "refined"}')
+@click.option("--settings", type=SectionType(config.RefinedMethod), default='{"kind": "refined"}')
 @click.option("--prior", type=IN, help="Prior's file; by default none.")
 @name_option
 @out_option("Predictions to write (HDF5).")

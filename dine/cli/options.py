@@ -19,7 +19,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 OUT = click.Path(path_type=Path)
 
 
-class Settings(click.ParamType):
+class SectionType(click.ParamType):
     """A settings section: JSON text, or ``@file`` for a YAML or JSON file; checked on reading."""
 
     name = "JSON|@FILE"
@@ -52,7 +52,7 @@ def json_or_file(context, parameter, value):
 def settings_option(model: type[config.Section]):
     return click.option(
         "--settings",
-        type=Settings(model),
+        type=SectionType(model),
         default="{}",
         show_default=True,
         help=f"{model.__name__} settings; keys as in config.yaml, defaults where left out.",

@@ -161,8 +161,8 @@ def evidence(metrics, methods, reference, shown, settings, out):
     Example: dine evidence a/metrics.csv b/metrics.csv --methods '{"pca": {"title": "PCA prior",
     "group": "prior"}}' --search lambda.json --out evidence
     """
-    from dine.reporting.evidence import Example, Files, build_evidence
+    from dine.reporting.evidence import ExamplePicture, Files, build_evidence
 
-    examples = [Example(*example) for example in shown["examples"]]
+    examples = [ExamplePicture(*example) for example in shown["examples"]]
     files = Files(metrics, shown["searches"], shown["diagnostics"], examples)
     build_evidence(files, out, methods=methods, reference=reference, config=settings)

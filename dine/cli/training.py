@@ -11,7 +11,7 @@ from dine import config
 from dine.cli.options import (
     FOLDER,
     IN,
-    Settings,
+    SectionType,
     batch_option,
     compute_flags,
     compute_options,
@@ -30,7 +30,7 @@ from dine.errors import ConfigError
 
 backbone_option = click.option(
     "--backbone",
-    type=Settings(config.BackboneConfig),
+    type=SectionType(config.BackboneConfig),
     default="{}",
     help=f"Kind and arguments of the backbone; by default {config.BackboneConfig().kind}.",
 )
@@ -140,7 +140,7 @@ prior_files_option = click.option(
     "--prior", "priors", type=(str, IN), multiple=True, help="Name and file of a prior; repeatable."
 )
 stage2_option = click.option(
-    "--stage2", "stage2_settings", type=Settings(config.Stage2), default="{}", help="Stage 2."
+    "--stage2", "stage2_settings", type=SectionType(config.Stage2), default="{}", help="Stage 2."
 )
 
 

@@ -65,7 +65,7 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
             f"{place} holds no Source_/Target_ pairs; expected the published layout "
             "(Deformation_Level/<level>/Source_… and Target_…), or a manifest (CSV)."
         )
-    report(inventory, folder)
+    write_inventory(inventory, folder)
     # Other meshes give another file, so that what was made of the old ones is made again even where
     # the run was killed right after this.
     if origin == PATH:
@@ -95,7 +95,7 @@ class _Download:
             log.info("downloading %s: %.1f of %s MB", path, done / 1e6, size)
 
 
-def report(inventory: Inventory, folder: Path) -> None:
+def write_inventory(inventory: Inventory, folder: Path) -> None:
     """Write what was found and what was left out as CSV."""
     files = Data(folder)
     with atomic_path(files.inventory) as temporary:

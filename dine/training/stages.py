@@ -22,7 +22,7 @@ from dine.models.state import check_still_wanted
 from dine.provenance import code_digest, run_record
 from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
-from dine.training.loop import Job, Seen, history_csv, train
+from dine.training.loop import Seen, TrainingJob, history_csv, train
 from dine.training.objective import Objective
 
 
@@ -115,7 +115,7 @@ def run(
     seen = _twice(Seen(*read_seen(pairs, targets, "train")))
     validated = Seen(*read_seen(pairs, targets, "val"))
     backbone.precision = compute.precision
-    job = Job(start.objective, settings, order.seed, order.out / "training", identity, name)
+    job = TrainingJob(start.objective, settings, order.seed, order.out / "training", identity, name)
     began = time.monotonic()
     history = train(
         backbone, job, seen, validated, device=compute.device, processes=compute.processes
