@@ -12,14 +12,13 @@ deformed: same vertices and faces, same order, moved.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import logging
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -48,7 +47,6 @@ SYNTHETIC = "synthetic"
 _MAKER = "dine.data.raw"
 _GENERATORS = {"primitives": primitive, "tissue": tissue_patch}
 _VAIN_DRAWS = 1000
-_Named = tuple[str, Callable[[], Surface]]
 
 
 @dataclass(frozen=True)
@@ -149,9 +147,10 @@ class Deformations:
 
 def write_dataset(
     folder: str | os.PathLike,
-    bases: Iterable[tuple[str, Surface]],
+    sources: Sequence[tuple[str, Callable[[], Surface]]],
     deformations: Deformations,
     origin: str,
+    identity: Any,
 ) -> None:
     """Deform every object at every level and write the folder described at the top.
 
@@ -160,99 +159,18 @@ def write_dataset(
 
     Args:
         folder: where to write.
-        bases: (name, undeformed surface in any unit). Characters in a name that are unsafe in
-            file names are replaced by '-'.
+        sources: the name of each object and what makes or reads its undeformed surface, in any
+            unit. Characters in a name that are unsafe in file names are replaced by '-'.
         deformations: of every object.
         origin: ``SYNTHETIC``, or the path that real base objects come from.
+        identity: stands for the content of all sources, so that it need not be made to find out
+            whether the folder is there already.
 
     Raises:
         ConfigError: percentages and widths too close together for so many pairs.
         DataError: no object is usable (a single unusable one is left out, with a warning and its
             reason in provenance.json), or ``folder`` holds something that DINE did not make.
         StorageError: the folder cannot be written.
-    """
-    surfaces = list(bases)
-    sources = [(name, partial(_given, surface)) for name, surface in surfaces]
-    identity = [[name, _fingerprint(surface)] for name, surface in surfaces]
-    _write(folder, sources, deformations, origin, identity)
-
-
-def synthesise(
-    folder: str | os.PathLike,
-    deformations: Deformations,
-    kind: Literal["primitives", "tissue"],
-    objects: int,
-    first: int = 0,
-) -> None:
-    """Write a fully synthetic dataset: ``objects`` objects, numbered from ``first``.
-
-    Args:
-        folder: where to write.
-        deformations: of every object.
-        kind: "primitives" (like SynBench) or "tissue" (like DeformedTissue).
-        objects: number of objects, >= 1.
-        first: number of the first one; object i is the same in every dataset of equal seed.
-
-    Raises:
-        As ``write_dataset``; ValueError for another kind, or numbers out of range.
-    """
-    if kind not in _GENERATORS:
-        raise ValueError(f"kind must be one of {', '.join(_GENERATORS)}, not {kind!r}.")
-    if objects < 1 or first < 0:
-        raise ValueError(f"objects must be at least 1 and first 0, not {objects} and {first}.")
-    generate = _GENERATORS[kind]
-    numbers = range(first, first + objects)
-    sources = [(f"{i:03d}", partial(generate, i, deformations.seed)) for i in numbers]
-    identity = {"kind": kind, "objects": objects, "first": first}
-    _write(folder, sources, deformations, SYNTHETIC, identity)
-
-
-def deform_bases(
-    folder: str | os.PathLike, deformations: Deformations, inventory: Inventory
-) -> None:
-    """Write a dataset of synthetic deformations of a user's own undeformed meshes or clouds.
-
-    Args:
-        folder: where to write.
-        deformations: of every object.
-        inventory: what ``layout.scan`` found; its ``bases`` are deformed. They may differ in units,
-            be open, in several components or hold duplicate vertices.
-
-    Raises:
-        As ``write_dataset``.
-    """
-    sources = [(name, partial(read_surface, path)) for name, path in inventory.bases.items()]
-    identity = {name: _file_identity(path) for name, path in inventory.bases.items()}
-    _write(folder, sources, deformations, str(inventory.folder.resolve()), identity)
-
-
-def _given(surface: Surface) -> Surface:
-    return surface
-
-
-def _fingerprint(surface: Surface) -> str:
-    faces = [] if surface.faces is None else surface.faces
-    arrays = (surface.vertices, np.asarray(faces, dtype=np.int64))
-    return digest([hashlib.sha256(np.ascontiguousarray(a)).hexdigest() for a in arrays])
-
-
-def _file_identity(path: Path) -> list[str]:
-    """Digests of the file and, for a SimTool ``.xyz``, of the file that holds its faces."""
-    parts = (path, path.with_suffix(".triangle"))
-    return [file_digest(part) for part in parts if os.access(part, os.R_OK) and part.is_file()]
-
-
-def _write(
-    folder: str | os.PathLike,
-    sources: list[_Named],
-    deformations: Deformations,
-    origin: str,
-    identity: Any,
-) -> None:
-    """``write_dataset`` for objects that are made or read one at a time.
-
-    ``identity`` stands for the content of all sources, so that it need not be made to find out
-    whether the folder is there already.
     """
     key = {
         "made_by": _MAKER,
@@ -289,6 +207,61 @@ def _write(
         ) from error
 
 
+def synthesise(
+    folder: str | os.PathLike,
+    deformations: Deformations,
+    kind: Literal["primitives", "tissue"],
+    objects: int,
+    first: int = 0,
+) -> None:
+    """Write a fully synthetic dataset: ``objects`` objects, numbered from ``first``.
+
+    Args:
+        folder: where to write.
+        deformations: of every object.
+        kind: "primitives" (like SynBench) or "tissue" (like DeformedTissue).
+        objects: number of objects, >= 1.
+        first: number of the first one; object i is the same in every dataset of equal seed.
+
+    Raises:
+        As ``write_dataset``; ValueError for another kind, or numbers out of range.
+    """
+    if kind not in _GENERATORS:
+        raise ValueError(f"kind must be one of {', '.join(_GENERATORS)}, not {kind!r}.")
+    if objects < 1 or first < 0:
+        raise ValueError(f"objects must be at least 1 and first 0, not {objects} and {first}.")
+    generate = _GENERATORS[kind]
+    numbers = range(first, first + objects)
+    sources = [(f"{i:03d}", partial(generate, i, deformations.seed)) for i in numbers]
+    identity = {"kind": kind, "objects": objects, "first": first}
+    write_dataset(folder, sources, deformations, SYNTHETIC, identity)
+
+
+def deform_bases(
+    folder: str | os.PathLike, deformations: Deformations, inventory: Inventory
+) -> None:
+    """Write a dataset of synthetic deformations of a user's own undeformed meshes or clouds.
+
+    Args:
+        folder: where to write.
+        deformations: of every object.
+        inventory: what ``layout.scan`` found; its ``bases`` are deformed. They may differ in units,
+            be open, in several components or hold duplicate vertices.
+
+    Raises:
+        As ``write_dataset``.
+    """
+    sources = [(name, partial(read_surface, path)) for name, path in inventory.bases.items()]
+    identity = {name: _file_identity(path) for name, path in inventory.bases.items()}
+    write_dataset(folder, sources, deformations, str(inventory.folder.resolve()), identity)
+
+
+def _file_identity(path: Path) -> list[str]:
+    """Digests of the file and, for a SimTool ``.xyz``, of the file that holds its faces."""
+    parts = (path, path.with_suffix(".triangle"))
+    return [file_digest(part) for part in parts if os.access(part, os.R_OK) and part.is_file()]
+
+
 def _distinct(name: str, values: Sequence[float]) -> list[float]:
     """The values as floats, refused if empty or if two would give the same file name."""
     values = [float(value) for value in values]
@@ -323,7 +296,10 @@ def _remove(folder: Path) -> None:
 
 
 def _fill(
-    folder: Path, sources: list[_Named], deformations: Deformations, key: dict[str, Any]
+    folder: Path,
+    sources: Sequence[tuple[str, Callable[[], Surface]]],
+    deformations: Deformations,
+    key: dict[str, Any],
 ) -> None:
     """Write everything; provenance.json, by which a folder counts as made, comes last."""
     written: dict[str, str] = {}

@@ -66,7 +66,6 @@ def test_nothing_imports_upwards(name, path):
 LONGEST, MOST_PARAMETERS = 60, 7
 EXCEPTIONS = {
     "dine.registration.register.register": "public, all but two of its arguments by keyword",
-    "dine.classical.methods.BCPD.__init__": "the algorithm's settings, as configurations name them",
 }
 
 

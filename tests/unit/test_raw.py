@@ -36,7 +36,10 @@ def recipe(**changes) -> Deformations:
 
 def write(folder, bases, **changes) -> None:
     origin = changes.pop("origin", raw.SYNTHETIC)
-    write_dataset(folder, bases, recipe(**changes), origin)
+    bases = list(bases)
+    sources = [(name, lambda surface=surface: surface) for name, surface in bases]
+    identity = [[name, surface.vertices.tolist()] for name, surface in bases]
+    write_dataset(folder, sources, recipe(**changes), origin, identity)
 
 
 def contents(folder) -> dict[str, bytes]:
