@@ -9,7 +9,7 @@ from pathlib import Path
 from dine.config import Pairs
 from dine.data.obtain import SYNTHETIC
 from dine.data.prepare import prepare_pairs
-from dine.data.raw import synthesise
+from dine.data.raw import Deformations, synthesise
 from dine.files import write_json
 
 TARGET = 20.0
@@ -47,10 +47,7 @@ def pair_making() -> list[dict]:
 
 def _raw(folder: Path, shape: str, targets: int) -> Path:
     """Mesh files of ``PAIRS`` pairs and the raw.json that names them."""
-    synthesise(
-        folder / "raw",
-        shape,
-        PAIRS // targets,
+    deformations = Deformations(
         levels=[0.3],
         control_percents=[2.0, 5.0, 10.0],
         widths=[0.3, 0.4, 0.5],
@@ -59,6 +56,7 @@ def _raw(folder: Path, shape: str, targets: int) -> Path:
         pairs_per_level=targets,
         seed=0,
     )
+    synthesise(folder / "raw", deformations, shape, PAIRS // targets)
     write_json(folder / "raw.json", {"folder": str(folder / "raw"), "origin": SYNTHETIC})
     return folder / "raw.json"
 

@@ -623,23 +623,8 @@ class Config(Compute):
             )
 
     def _check_evidence(self) -> None:
-        taken = {STAGE1, CONTROL, *self.priors_of_stage2}
-        for name in self.evidence.backbones:
-            if name in self.backbones or not _NAME.match(name):
-                raise ValueError(
-                    f"`evidence.backbones.{name}` must have a name of its own, of lower-case "
-                    "letters, digits and underscores"
-                )
         for name, backbone in self.evidence.backbones.items():
-            if backbone.own_lambda:
-                raise ValueError(
-                    f"`evidence.backbones.{name}.own_lambda` cannot be set: the evidence takes the "
-                    "λ of `lambda_search`; move the backbone to `backbones`, or leave this out"
-                )
-            for prior in backbone.priors:
-                self._known("priors", prior, f"evidence.backbones.{name}.priors")
-            for dataset in backbone.datasets or ():
-                self._known("datasets", dataset, f"evidence.backbones.{name}.datasets")
+            self._check_evidence_backbone(name, backbone)
         for name, data in self.evidence.test_sets.items():
             if name in self.datasets or not _NAME.match(name):
                 raise ValueError(
@@ -647,37 +632,14 @@ class Config(Compute):
                     "letters, digits and underscores"
                 )
             self._known("datasets", data.networks, f"evidence.test_sets.{name}.networks")
+        taken = {STAGE1, CONTROL, *self.priors_of_stage2}
         for name, method in self.evidence.methods.items():
-            where = f"evidence.methods.{name}"
             if name in taken or not _NAME.match(name):
                 raise ValueError(
-                    f"`{where}` must have a name of its own, of lower-case letters, digits and "
-                    f"underscores; taken are {', '.join(sorted(taken))}"
+                    f"`evidence.methods.{name}` must have a name of its own, of lower-case letters,"
+                    f" digits and underscores; taken are {', '.join(sorted(taken))}"
                 )
-            for dataset in method.datasets or ():
-                self._known("datasets", dataset, f"{where}.datasets")
-            if isinstance(method, ClassicalMethod):
-                continue
-            for backbone in method.backbones or ():
-                if backbone not in self.every_backbone:
-                    raise ValueError(
-                        f"`{where}.backbones` names {backbone!r}, which is neither under "
-                        "`backbones` nor under `evidence.backbones`"
-                    )
-            if method.prior is not None:
-                self._known("priors", method.prior, f"{where}.prior")
-            if isinstance(method, RefinedMethod):
-                trained = {STAGE1, CONTROL} | {
-                    other
-                    for other, found in self.evidence.methods.items()
-                    if isinstance(found, Stage2Method)
-                }
-                if method.of not in trained:
-                    raise ValueError(
-                        f"`{where}.of` is {method.of!r}; expected one of "
-                        f"{', '.join(sorted(trained))}"
-                    )
-
+            self._check_method(method, f"evidence.methods.{name}")
         # A prior that no backbone is trained with is not drawn, as a method that was taken away.
         known = {*taken, *self.priors, *self.evidence.methods}
         unknown = [name for name in self.evidence.examples if name not in known]
@@ -685,6 +647,44 @@ class Config(Compute):
             raise ValueError(
                 f"`evidence.examples` names {unknown[0]!r}, which is no method; expected some of "
                 f"{', '.join(sorted(known))}"
+            )
+
+    def _check_evidence_backbone(self, name: str, backbone: EvidenceBackbone) -> None:
+        where = f"evidence.backbones.{name}"
+        if name in self.backbones or not _NAME.match(name):
+            raise ValueError(
+                f"`{where}` must have a name of its own, of lower-case letters, digits and "
+                "underscores"
+            )
+        if backbone.own_lambda:
+            raise ValueError(
+                f"`{where}.own_lambda` cannot be set: the evidence takes the λ of "
+                "`lambda_search`; move the backbone to `backbones`, or leave this out"
+            )
+        for prior in backbone.priors:
+            self._known("priors", prior, f"{where}.priors")
+        for dataset in backbone.datasets or ():
+            self._known("datasets", dataset, f"{where}.datasets")
+
+    def _check_method(self, method: AnyMethod, where: str) -> None:
+        for dataset in method.datasets or ():
+            self._known("datasets", dataset, f"{where}.datasets")
+        if isinstance(method, ClassicalMethod):
+            return
+        for backbone in method.backbones or ():
+            if backbone not in self.every_backbone:
+                raise ValueError(
+                    f"`{where}.backbones` names {backbone!r}, which is neither under "
+                    "`backbones` nor under `evidence.backbones`"
+                )
+        if method.prior is not None:
+            self._known("priors", method.prior, f"{where}.prior")
+        methods = self.evidence.methods.items()
+        stage2 = [name for name, other in methods if isinstance(other, Stage2Method)]
+        trained = {STAGE1, CONTROL, *stage2}
+        if isinstance(method, RefinedMethod) and method.of not in trained:
+            raise ValueError(
+                f"`{where}.of` is {method.of!r}; expected one of {', '.join(sorted(trained))}"
             )
 
     def backbones_of(self, dataset: str) -> list[str]:

@@ -18,7 +18,7 @@ from dine.config import CONTROL, STAGE1, BackboneConfig, Config, Section
 from dine.provenance import code_digest, folder_signature
 from dine.results import (
     NO_BACKBONE,
-    Cell,
+    EvidenceCell,
     Results,
     backbone_and_seed,
     conditions,
@@ -269,7 +269,7 @@ class EvidencePlan(Plan):
     """The evidence. What a method's files depend on is what the configuration says of it."""
 
     @cached_property
-    def groups(self) -> dict[tuple[str, str, int], list[Cell]]:
+    def groups(self) -> dict[tuple[str, str, int], list[EvidenceCell]]:
         # Once: to look through all of them for each job would take minutes for thousands of jobs.
         return evidence_groups(self.config)
 
@@ -367,10 +367,10 @@ class EvidencePlan(Plan):
 
     # --- results
 
-    def predictions(self, cells: Iterable[Cell]) -> list[Path]:
+    def predictions(self, cells: Iterable[EvidenceCell]) -> list[Path]:
         return [self.files.evidence.cell(*cell).predictions for cell in cells]
 
-    def example_cells(self, dataset: str) -> list[Cell]:
+    def example_cells(self, dataset: str) -> list[EvidenceCell]:
         """What is drawn of a dataset: with the backbone of the search and the first seed."""
         evidence = self.config.evidence
         place = (self.config.lambda_search.backbone, evidence.seeds[0])
@@ -426,7 +426,7 @@ class EvidencePlan(Plan):
                 found += self._kept_of(cell, replica(self.config, backbone, seed))
         return list(dict.fromkeys(found))
 
-    def _kept_of(self, cell: Cell, folder: str) -> list[Path]:
+    def _kept_of(self, cell: EvidenceCell, folder: str) -> list[Path]:
         """Network, predictions and prior of one evaluation."""
         trained = self.config.networks(cell.dataset)
         method = self.config.evidence.methods.get(cell.method)

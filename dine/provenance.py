@@ -1,6 +1,6 @@
 """Who made a result: code, versions, inputs. Cheap to import, since every DAG asks for it.
 
-The code behind a step is found by reading, without running any of it: the step's command in
+The code behind a step is found by reading, without running any of it: the step's command below
 ``dine.cli``, the modules that it imports, those that they import, and so on; and the modules of the
 classes that the configuration names, a user's own among them.
 """
@@ -106,9 +106,10 @@ def code_files(step: str, *classes: str) -> dict[str, Path]:
 def _command(step: str) -> tuple[str, tuple[str, ...]]:
     """What a command does, as text without its help, and the modules that it imports."""
     name = step.replace("-", "_")
-    for node in _parsed(PACKAGE / "cli.py").body:
-        if isinstance(node, ast.FunctionDef) and node.name == name:
-            return _tree(node.body), tuple(_imports(node.body, "dine.cli", False))
+    for file in sorted((PACKAGE / "cli").glob("*.py")):
+        for node in _parsed(file).body:
+            if isinstance(node, ast.FunctionDef) and node.name == name:
+                return _tree(node.body), tuple(_imports(node.body, f"dine.cli.{file.stem}", False))
     raise KeyError(step)
 
 
@@ -144,7 +145,8 @@ def _registered() -> dict[str, list[str]]:
 def _follow(module: str, roots: tuple[str, ...], found: dict[str, Path]) -> None:
     """Add a module and, unless it is installed and foreign, all that it imports to ``found``."""
     file = _source(module)
-    if module in found or module in NEUTRAL or file is None or not _own(module, file, roots):
+    neutral = module in NEUTRAL or module.startswith("dine.cli.")
+    if module in found or neutral or file is None or not _own(module, file, roots):
         return
     found[module] = file
     if module.partition(".")[0] == "dine":

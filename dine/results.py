@@ -150,12 +150,12 @@ class Results:
         return self.root / "pretraining" / backbone / f"fields_{shape}.h5"
 
     @property
-    def evidence(self) -> Evidence:
-        return Evidence(self.root / "evidence")
+    def evidence(self) -> EvidenceFiles:
+        return EvidenceFiles(self.root / "evidence")
 
 
 @dataclass(frozen=True)
-class Evidence:
+class EvidenceFiles:
     """Files of the evidence."""
 
     folder: Path
@@ -224,7 +224,7 @@ NO_BACKBONE = "none"
 """Backbone of methods without one, which are compared with those of every backbone."""
 
 
-class Cell(NamedTuple):
+class EvidenceCell(NamedTuple):
     """One evaluation of the evidence; methods without a backbone have seed 0."""
 
     dataset: str
@@ -233,7 +233,7 @@ class Cell(NamedTuple):
     method: str
 
 
-def evidence_cells(config: Config) -> list[Cell]:
+def evidence_cells(config: Config) -> list[EvidenceCell]:
     """Every evaluation of the evidence."""
     evidence = config.evidence
     cells = []
@@ -241,7 +241,7 @@ def evidence_cells(config: Config) -> list[Cell]:
         trained = config.networks(dataset)
         for name, method in evidence.methods.items():
             if isinstance(method, ClassicalMethod) and trained in (method.datasets or [trained]):
-                cells.append(Cell(dataset, NO_BACKBONE, 0, name))
+                cells.append(EvidenceCell(dataset, NO_BACKBONE, 0, name))
         for backbone, settings in config.every_backbone.items():
             if trained not in (getattr(settings, "datasets", None) or [trained]):
                 continue
@@ -256,13 +256,13 @@ def evidence_cells(config: Config) -> list[Cell]:
                     fits &= trained in (method.datasets or [trained])
                     if fits and number < (method.seeds or len(evidence.seeds)):
                         names.append(name)
-                cells += [Cell(dataset, backbone, seed, name) for name in names]
+                cells += [EvidenceCell(dataset, backbone, seed, name) for name in names]
     return cells
 
 
-def evidence_groups(config: Config) -> dict[tuple[str, str, int], list[Cell]]:
+def evidence_groups(config: Config) -> dict[tuple[str, str, int], list[EvidenceCell]]:
     """The evaluations that one job makes together, by (dataset, backbone, seed)."""
-    groups: dict[tuple[str, str, int], list[Cell]] = {}
+    groups: dict[tuple[str, str, int], list[EvidenceCell]] = {}
     for cell in evidence_cells(config):
         groups.setdefault(cell[:3], []).append(cell)
     return groups

@@ -12,7 +12,10 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
 # Longest first, so that no worker is left alone with one of them in the end.
-LONG = ("workflow/test_workflow.py", "workflow/", "test_stages.py", "test_fuzz.py", "test_parallel")
+LONG = (
+    *("workflow/test_workflow.py", "workflow/", "integration/test_stages.py"),
+    *("hostile/test_fuzz.py", "integration/test_parallel.py"),
+)
 
 
 def pytest_collection_modifyitems(items):

@@ -71,7 +71,7 @@ class _Matches(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Options:
+class Parameters:
     """Settings of :func:`bcpd`, named as in the paper.
 
     Attributes:
@@ -99,7 +99,7 @@ class Options:
     tolerance: float = 1e-4
 
 
-def bcpd(source: np.ndarray, target: np.ndarray, options: Options | None = None) -> Result:
+def bcpd(source: np.ndarray, target: np.ndarray, options: Parameters | None = None) -> Result:
     """Register (N, 3) source points to (M, 3) target points; the target's order does not matter.
 
     Both clouds are first brought to zero mean and unit variance per coordinate, as the author's
@@ -108,7 +108,7 @@ def bcpd(source: np.ndarray, target: np.ndarray, options: Options | None = None)
     Raises:
         DataError: a cloud whose points coincide.
     """
-    options = options or Options()
+    options = options or Parameters()
     y, _, _ = _standardised(source, "source")
     x, center_x, unit_x = _standardised(target, "target")
     state = _State(y, x, options)
@@ -125,7 +125,7 @@ def bcpd(source: np.ndarray, target: np.ndarray, options: Options | None = None)
 class _State:
     """Everything that the iterations change, for standardised clouds y and x."""
 
-    def __init__(self, y: np.ndarray, x: np.ndarray, options: Options):
+    def __init__(self, y: np.ndarray, x: np.ndarray, options: Parameters):
         self.y, self.x, self.options = y, x, options
         count, self.dim = y.shape
         self.root = covariance_root(

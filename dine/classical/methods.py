@@ -9,6 +9,7 @@ sweep.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
@@ -28,10 +29,26 @@ from dine.registry import Registry
 # unregistered 0.161. docs/reference/classical.md has the sweep.
 
 
+@dataclass(kw_only=True)
 class Classical(ABC):
-    """Base of the classical methods; all are deterministic and run on one thread."""
+    """Base of the classical methods; all are deterministic and run on one thread.
+
+    Arguments are fields: numbers are positive, but ``outliers``, a share.
+
+    Raises:
+        ConfigError: an argument outside its range.
+    """
 
     registered_name: ClassVar[str]
+
+    def __post_init__(self):
+        for field in fields(self):
+            value, read = getattr(self, field.name), {"int": int, "bool": bool}.get(field.type)
+            if field.name == "outliers":
+                value = _share(field.name, value)
+            elif read is not bool:
+                value = _positive(field.name, value)
+            setattr(self, field.name, read(value) if read else value)
 
     def __call__(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         """The displacement (N, 3), float64, of each source point.
@@ -67,6 +84,7 @@ class Unregistered(Classical):
 
 
 @CLASSICAL.register("icp")
+@dataclass(kw_only=True)
 class RigidICP(Classical):
     """Rotation and translation by iterative closest points (trimesh), from where the clouds are.
 
@@ -77,9 +95,8 @@ class RigidICP(Classical):
         tolerance: stop once the mean squared distance changes less than this.
     """
 
-    def __init__(self, *, iterations: int = 200, tolerance: float = 1e-9):
-        self.iterations = int(_positive("iterations", iterations))
-        self.tolerance = _positive("tolerance", tolerance)
+    iterations: int = 200
+    tolerance: float = 1e-9
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         matrix, _, _ = trimesh.registration.icp(
@@ -94,6 +111,7 @@ class RigidICP(Classical):
 
 
 @CLASSICAL.register("cpd")
+@dataclass(kw_only=True)
 class CPD(Classical):
     """Deformable coherent point drift (Myronenko and Song, IEEE TPAMI 2010), by rustcpd.
 
@@ -106,22 +124,12 @@ class CPD(Classical):
         tolerance: stop once the variance of the mixture changes less than this.
     """
 
-    def __init__(
-        self,
-        *,
-        beta: float = 0.5,
-        lam: float = 64.0,
-        outliers: float = 0.1,
-        rank: int = 400,
-        iterations: int = 300,
-        tolerance: float = 1e-7,
-    ):
-        self.beta = _positive("beta", beta)
-        self.lam = _positive("lam", lam)
-        self.outliers = _share("outliers", outliers)
-        self.rank = int(_positive("rank", rank))
-        self.iterations = int(_positive("iterations", iterations))
-        self.tolerance = _positive("tolerance", tolerance)
+    beta: float = 0.5
+    lam: float = 64.0
+    outliers: float = 0.1
+    rank: int = 400
+    iterations: int = 300
+    tolerance: float = 1e-7
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         try:
@@ -149,6 +157,7 @@ class CPD(Classical):
 
 
 @CLASSICAL.register("bcpd")
+@dataclass(kw_only=True)
 class BCPD(Classical):
     """Bayesian coherent point drift (Hirose, IEEE TPAMI 2021): :func:`dine.classical.bcpd.bcpd`.
 
@@ -163,32 +172,21 @@ class BCPD(Classical):
         tolerance: stop once the standard deviation of the mixture changes less than this.
     """
 
-    def __init__(
-        self,
-        *,
-        beta: float = 1.4,
-        lam: float = 20.0,
-        outliers: float = 0.1,
-        gamma: float = 1.0,
-        uncertain: bool = False,
-        rank: int = 300,
-        iterations: int = 500,
-        tolerance: float = 1e-4,
-    ):
-        self.beta = _positive("beta", beta)
-        self.lam = _positive("lam", lam)
-        self.outliers = _share("outliers", outliers)
-        self.gamma = _positive("gamma", gamma)
-        self.uncertain = bool(uncertain)
-        self.rank = int(_positive("rank", rank))
-        self.iterations = int(_positive("iterations", iterations))
-        self.tolerance = _positive("tolerance", tolerance)
+    beta: float = 1.4
+    lam: float = 20.0
+    outliers: float = 0.1
+    gamma: float = 1.0
+    uncertain: bool = False
+    rank: int = 300
+    iterations: int = 500
+    tolerance: float = 1e-4
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        return bcpd.bcpd(source, target, bcpd.Options(**vars(self))).moved
+        return bcpd.bcpd(source, target, bcpd.Parameters(**vars(self))).moved
 
 
 @CLASSICAL.register("smooth")
+@dataclass(kw_only=True)
 class SmoothFields(Classical):
     """The most probable smooth field: :func:`dine.refinement.refine.refine` without a network.
 
@@ -198,8 +196,7 @@ class SmoothFields(Classical):
         rounds: of expectation and maximisation.
     """
 
-    def __init__(self, *, rounds: int = ROUNDS):
-        self.rounds = int(_positive("rounds", rounds))
+    rounds: int = ROUNDS
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
         return source + refine(source, target, options=Options(self.rounds)).mean

@@ -68,6 +68,21 @@ class _WrongContent(Exception):
     """A complete transfer whose length or checksum is not the announced one."""
 
 
+@dataclass(frozen=True)
+class Fetching:
+    """How files are fetched.
+
+    Attributes:
+        chunk: bytes per piece.
+        retries: further attempts per request after a failure that may be temporary.
+        timeout: seconds without an answer after which a request counts as failed.
+    """
+
+    chunk: int = 1 << 20
+    retries: int = 3
+    timeout: float = 30
+
+
 def download(
     doi: str,
     folder: str | os.PathLike,
@@ -76,9 +91,7 @@ def download(
     *,
     progress: Progress | None = None,
     session: requests.Session | None = None,
-    chunk: int = 1 << 20,
-    retries: int = 3,
-    timeout: float = 30,
+    how: Fetching = Fetching(),
 ) -> list[Path]:
     """Download every file of a dataset and unpack its archives.
 
@@ -95,9 +108,7 @@ def download(
         progress: called after every piece with the file's relative path, the bytes there, and
             the bytes in all (None if unknown).
         session: used for every request instead of a fresh one.
-        chunk: bytes per piece.
-        retries: further attempts per request after a failure that may be temporary.
-        timeout: seconds without an answer after which a request counts as failed.
+        how: size of pieces, retries and timeout.
 
     Returns:
         The downloaded files, archives included, in the order of the server's listing.
@@ -113,41 +124,7 @@ def download(
     with contextlib.ExitStack() as stack:
         if session is None:
             session = stack.enter_context(requests.Session())
-        client = _Client(session, server.rstrip("/"), doi, chunk, retries, timeout, progress)
-        files = client.list_files(version)
-        unpacked = _unpack_folders(files)
-        for path in _every_path(files, unpacked):
-            _refuse_links(folder, path)
-        fetched = [(file, client.fetch(file, folder)) for file in files]
-    stored = [(file, variant) for file, variant in fetched if variant is not None]
-    for file, _ in stored:
-        if file.path in unpacked:
-            _unpack(folder / file.path, folder / unpacked[file.path], file.checksum)
-    restricted = [str(file.path) for file, variant in fetched if variant is None]
-    if restricted:
-        raise client.error(
-            f"{len(restricted)} of its {len(files)} files are restricted ({', '.join(restricted)})"
-            f"; ask the authors for access, put these files into {folder} by hand and run the "
-            "same command again"
-        )
-    write_json(
-        folder / _MANIFEST,
-        {
-            "doi": doi,
-            "server": client.server,
-            "version": version,
-            "files": [
-                {
-                    "path": str(variant.path),
-                    "size": (folder / variant.path).stat().st_size,
-                    "checksum": file.checksum,
-                }
-                for file, variant in stored
-            ],
-            "unpacked": {str(path): str(target) for path, target in unpacked.items()},
-        },
-    )
-    return [folder / variant.path for _, variant in stored]
+        return _Client(session, server.rstrip("/"), doi, how, progress).download(folder, version)
 
 
 # --- talking to the server --------------------------------------------------------------------
@@ -158,10 +135,36 @@ class _Client:
     session: requests.Session
     server: str
     doi: str
-    chunk: int
-    retries: int
-    timeout: float
+    how: Fetching
     progress: Progress | None
+
+    def download(self, folder: Path, version: str) -> list[Path]:
+        """Fetch, unpack and list everything; see :func:`download`."""
+        files = self.list_files(version)
+        unpacked = _unpack_folders(files)
+        for path in _every_path(files, unpacked):
+            _refuse_links(folder, path)
+        fetched = [(file, self.fetch(file, folder)) for file in files]
+        stored = [(file, variant.path) for file, variant in fetched if variant is not None]
+        for file, _ in stored:
+            if file.path in unpacked:
+                _unpack(folder / file.path, folder / unpacked[file.path], file.checksum)
+        restricted = [str(file.path) for file, variant in fetched if variant is None]
+        if restricted:
+            raise self.error(
+                f"{len(restricted)} of its {len(files)} files are restricted "
+                f"({', '.join(restricted)}); ask the authors for access, put these files into "
+                f"{folder} by hand and run the same command again"
+            )
+        sizes = [(folder / path).stat().st_size for _, path in stored]
+        listed = [
+            {"path": str(path), "size": size, "checksum": file.checksum}
+            for (file, path), size in zip(stored, sizes, strict=True)
+        ]
+        manifest = {"doi": self.doi, "server": self.server, "version": version, "files": listed}
+        manifest["unpacked"] = {str(path): str(target) for path, target in unpacked.items()}
+        write_json(folder / _MANIFEST, manifest)
+        return [folder / path for _, path in stored]
 
     def error(self, reason: str) -> DownloadError:
         return DownloadError(f"Could not download doi:{self.doi} from {self.server}: {reason}.")
@@ -212,7 +215,7 @@ class _Client:
     def _small(self, answer: requests.Response) -> bytes:
         """The content of an answer that has no reason to be large."""
         content = bytearray()
-        for piece in answer.iter_content(self.chunk):
+        for piece in answer.iter_content(self.how.chunk):
             content += piece
             if len(content) > _LARGEST_LIST:
                 raise self.error(f"its list of files is larger than {_LARGEST_LIST} bytes")
@@ -303,7 +306,7 @@ class _Client:
                 start = 0
             with _storage_errors(part), open(part, "ab" if resumed else "wb") as stream:
                 done = start
-                for piece in answer.iter_content(self.chunk):
+                for piece in answer.iter_content(self.how.chunk):
                     stream.write(piece)
                     done += len(piece)
                     if variant.size is not None and done > variant.size:
@@ -314,7 +317,7 @@ class _Client:
 
     def _persist(self, operation: Callable[[], Any], what: str) -> Any:
         """Repeat an operation after failures that may be temporary, waiting longer each time."""
-        for attempt in range(self.retries + 1):
+        for attempt in range(self.how.retries + 1):
             if attempt:
                 time.sleep(min(2 ** (attempt - 1), 30))
             try:
@@ -322,7 +325,7 @@ class _Client:
             except _Retry as error:
                 problem = str(error)
             except requests.Timeout:
-                problem = f"no answer within {self.timeout:g} s"
+                problem = f"no answer within {self.how.timeout:g} s"
             except requests.RequestException as error:
                 if isinstance(error, ValueError):  # a malformed address or answer stays so
                     raise
@@ -335,7 +338,7 @@ class _Client:
         # Compression on the way would break lengths and ranges.
         headers = {"Accept-Encoding": "identity"} | (headers or {})
         with self.session.get(
-            address, headers=headers, stream=True, timeout=self.timeout, **options
+            address, headers=headers, stream=True, timeout=self.how.timeout, **options
         ) as answer:
             status = f"{answer.status_code} {answer.reason}"
             if answer.status_code == 429 or answer.status_code >= 500:

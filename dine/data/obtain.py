@@ -10,7 +10,7 @@ import pandas as pd
 
 from dine.config import Dataset
 from dine.data.layout import Inventory, scan
-from dine.data.raw import deform_bases, synthesise
+from dine.data.raw import Deformations, deform_bases, synthesise
 from dine.errors import DataError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json
 from dine.progress import LOG_SECONDS
@@ -42,17 +42,16 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
     """
     source = dataset.source
     made = folder / "raw"
-    recipe = dataset.recipe.model_dump(exclude={"shape", "objects"})
-    recipe |= {"points": dataset.pairs.points, "seed": seed}
     if source.kind == "synthetic":
-        synthesise(made, dataset.recipe.shape, dataset.recipe.objects, first_object, **recipe)
+        shape, objects = dataset.recipe.shape, dataset.recipe.objects
+        synthesise(made, _deformations(dataset, seed), shape, objects, first_object)
         place, origin = made, SYNTHETIC
     elif source.kind == "path":
         place, origin = Path(source.folder).expanduser(), PATH
         inventory = scan(place)
         if not inventory.has_pairs:
             log.info("%s holds undeformed objects only; making deformed targets", place)
-            deform_bases(made, inventory, **recipe)
+            deform_bases(made, _deformations(dataset, seed), inventory)
             place, origin = made, BASES
     else:
         # Imported here, since only this source needs the network.
@@ -66,7 +65,7 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
             f"{place} holds no Source_/Target_ pairs; expected the published layout "
             "(Deformation_Level/<level>/Source_… and Target_…), or a manifest (CSV)."
         )
-    report(inventory, folder)
+    write_inventory(inventory, folder)
     # Other meshes give another file, so that what was made of the old ones is made again even where
     # the run was killed right after this.
     if origin == PATH:
@@ -76,6 +75,11 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
     else:
         content = file_digest(made / "provenance.json")
     write_json(Data(folder).raw, {"folder": str(place), "origin": origin, "content": content})
+
+
+def _deformations(dataset: Dataset, seed: int) -> Deformations:
+    recipe = dataset.recipe.model_dump(exclude={"shape", "objects"})
+    return Deformations(**recipe, points=dataset.pairs.points, seed=seed)
 
 
 class _Download:
@@ -91,7 +95,7 @@ class _Download:
             log.info("downloading %s: %.1f of %s MB", path, done / 1e6, size)
 
 
-def report(inventory: Inventory, folder: Path) -> None:
+def write_inventory(inventory: Inventory, folder: Path) -> None:
     """Write what was found and what was left out as CSV."""
     files = Data(folder)
     with atomic_path(files.inventory) as temporary:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dine.config import Pairs
 from dine.data.layout import Inventory, PairFiles, check_pair
-from dine.data.names import deformation_of
 from dine.data.obtain import obtained
 from dine.data.pairs import (
     PAIR_DATASETS,
@@ -35,8 +32,8 @@ from dine.data.sampling import (
     neighbourhood_agreement,
     sample_surface,
 )
+from dine.data.splits import Row, Shares, split
 from dine.errors import ConfigError, DataError
-from dine.files import digest
 from dine.geometry.frame import Frame
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
@@ -65,8 +62,8 @@ def prepare_pairs(
     """
     found = [obtained(path) for path in (raw, unseen) if path is not None]
     count = sum(len(inventory.clean) for inventory, _ in found)
-    split = settings.split.model_dump(exclude={"by"})
-    everything = dict.fromkeys(split, 0.0) | {"test": 1.0}
+    shares = Shares(settings.split.model_dump(exclude={"by"}), settings.split.by)
+    everything = Shares({"test": 1.0})
     sets = []
     with Progress("pairs", count, unit="pair") as bar:
         for number, (inventory, origin) in enumerate(found):
@@ -74,8 +71,7 @@ def prepare_pairs(
                 inventory,
                 points=settings.points,
                 convention=settings.convention,
-                split=everything if test_only or number else split,
-                by="object" if test_only or number else settings.split.by,
+                shares=everything if test_only or number else shares,
                 seed=seed,
                 origin=origin,
                 progress=lambda done, total: bar.update(),
@@ -156,8 +152,7 @@ def make_pairs(
     *,
     points: int,
     convention: str,
-    split: Mapping[str, float],
-    by: str = "object",
+    shares: Shares,
     seed: int,
     origin: str = "files",
     progress: Callable[[int, int], None] | None = None,
@@ -166,15 +161,8 @@ def make_pairs(
 
     Points are drawn on the source and found again on the target. The draw is keyed by seed and
     object, and the convention is computed once for each distinct undeformed surface, so that all
-    targets of an object share points and order.
-
-    Without a published split, objects are shuffled by ``seed`` and shared out by fraction, at least
-    one to each split whose fraction is not zero; or, ``by`` deformation, the pairs of each object
-    are, as evenly over levels as can be. Pairs of one object and name stay together there, since
-    they may be one deformation at several levels. A published split (``inventory.split``) is kept
-    as it is: by pair id or name where it has that, otherwise by object; objects in two of its parts
-    are logged and kept. Where it has no ``val``, some of its training objects become ``val``, or,
-    where all of these (but one) are tested on as well, some of their deformations.
+    targets of an object share points and order. Pairs are split as :func:`dine.data.splits.split`
+    says.
 
     Attributes of the result: ``seed``, ``convention``, ``points``, ``origin``, ``split_rule``
     (``objects``, ``deformations`` or ``published``), ``split_train``, ``split_val``,
@@ -186,8 +174,7 @@ def make_pairs(
         inventory: what ``dine.data.layout.scan`` found.
         points: N, points per cloud.
         convention: see ``dine.data.sampling.convention_order``.
-        split: fractions for ``train``, ``val`` and ``test``; they sum to 1.
-        by: what these are fractions of, ``object`` or ``deformation``.
+        shares: of ``train``, ``val`` and ``test``.
         seed: >= 0.
         origin: where the data come from, such as ``"synthetic"``.
         progress: called with the numbers of pairs done and of all pairs.
@@ -196,35 +183,16 @@ def make_pairs(
         The pairs, grouped by split, and (id, reason) of every pair that was left out.
 
     Raises:
-        ConfigError: unusable fractions, number of points or convention.
+        ConfigError: unusable number of points or convention.
         DataError: no usable pair, or too few objects or deformations for the splits.
     """
     if points < 1:
         raise ConfigError(f"The number of points must be at least 1, found {points}.")
-    fractions = _checked_fractions(split)
     rows, skipped = _sample_all(inventory, _Sampler(points, convention, seed), progress)
-    if inventory.split is None:
-        # Without any row, the reasons for that say more than the number of objects.
-        parts = _share_out(rows, fractions, by, seed) if rows else []
-        facts = {"split_rule": f"{by}s", "split_leakage": "", "split_unknown": 0}
-    else:
-        parts, facts = _published_split(rows, inventory.split, fractions, seed)
-    kept = []
-    for row, part in zip(rows, parts, strict=True):
-        if part is None:
-            reason = "the published split names neither the pair nor its object"
-            skipped.append((row["name"], reason))
-        else:
-            kept.append(row | {"split": part})
-    for name, reason in skipped:
-        _log.warning("Left out pair %s: %s", name, reason)
-    if not kept:
-        first = f"; the first of {len(skipped)}: {skipped[0][1]}" if skipped else ""
-        raise DataError(
-            f"{inventory.folder} holds no usable pair of a source and its deformed target{first}"
-        )
-    # Reading one split is then reading one run of rows.
-    kept.sort(key=lambda row: SPLITS.index(row["split"]))
+    parts, facts = split(rows, shares, seed, inventory.split)
+    kept, unnamed = _in_parts(rows, parts)
+    skipped += unnamed
+    _report(inventory, kept, skipped)
     pairs = PairSet(
         **{column: np.array([row[column] for row in kept]) for column in PAIR_DATASETS},
         attributes={
@@ -233,22 +201,43 @@ def make_pairs(
             "points": int(points),
             "origin": origin,
             **facts,
-            **{f"split_{part}": fraction for part, fraction in fractions.items()},
+            **{f"split_{part}": fraction for part, fraction in shares.fractions.items()},
         },
     )
     pairs.attributes["checksum"] = pairs.checksum
     return pairs, skipped
 
 
+def _report(inventory: Inventory, kept: list[Row], skipped: list[tuple[str, str]]) -> None:
+    """Log what was left out; raise where nothing is left."""
+    for name, reason in skipped:
+        _log.warning("Left out pair %s: %s", name, reason)
+    if not kept:
+        first = f"; the first of {len(skipped)}: {skipped[0][1]}" if skipped else ""
+        raise DataError(
+            f"{inventory.folder} holds no usable pair of a source and its deformed target{first}"
+        )
+
+
+def _in_parts(rows: list[Row], parts: list[str | None]) -> tuple[list[Row], list[tuple[str, str]]]:
+    """The rows that have a part, grouped by it; the names of the others, with the reason."""
+    kept, unnamed = [], []
+    for row, part in zip(rows, parts, strict=True):
+        if part is None:
+            reason = "the published split names neither the pair nor its object"
+            unnamed.append((row["name"], reason))
+        else:
+            kept.append(row | {"split": part})
+    # Reading one split is then reading one run of rows.
+    return sorted(kept, key=lambda row: SPLITS.index(row["split"])), unnamed
+
+
 # --- from files to points ---------------------------------------------------------------------
-
-
-_Row = dict[str, Any]
 
 
 def _sample_all(
     inventory: Inventory, sampler: _Sampler, progress: Callable[[int, int], None] | None
-) -> tuple[list[_Row], list[tuple[str, str]]]:
+) -> tuple[list[Row], list[tuple[str, str]]]:
     """All columns but the split, row by row, and the pairs that have none, with reasons."""
     every = inventory.clean
     rows, skipped, names = [], [], set()
@@ -285,7 +274,7 @@ class _Sampler:
         self.points, self.convention, self.seed = points, convention, seed
         self._known: dict[tuple[str, bytes], _Sampled] = {}
 
-    def pair(self, files: PairFiles) -> _Row:
+    def pair(self, files: PairFiles) -> Row:
         """The columns of one pair that come from its surfaces."""
         if files.level is None:
             raise DataError(
@@ -333,158 +322,3 @@ class _Sampler:
 def _relative(path: Path, folder: Path) -> str:
     path = Path(path)
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
-
-
-# --- splits -----------------------------------------------------------------------------------
-
-
-def _checked_fractions(split: Mapping[str, float]) -> dict[str, float]:
-    unknown = sorted(set(split) - set(SPLITS))
-    fractions = {part: float(split.get(part, 0.0)) for part in SPLITS}
-    values = np.array(list(fractions.values()))
-    if unknown or not (values >= 0).all() or not np.isclose(values.sum(), 1.0):
-        raise ConfigError(
-            "The split needs fractions for train, val and test that are not negative and sum to "
-            f"1, found {dict(split)}."
-        )
-    return fractions
-
-
-def _share_out(rows: list[_Row], fractions: Mapping[str, float], by: str, seed: int) -> list[str]:
-    """The part of each row."""
-    if by == "deformation":
-        return _split_deformations(rows, fractions, seed)
-    by_object = _split_objects({row["object"] for row in rows}, fractions, seed)
-    return [by_object[row["object"]] for row in rows]
-
-
-def _split_deformations(rows: list[_Row], fractions: Mapping[str, float], seed: int) -> list[str]:
-    """The part of each row, so that every object is in every part that is not to be empty.
-
-    Rows of one object and name go together.
-    """
-    wanted = {part: fraction for part, fraction in fractions.items() if fraction > 0}
-    objects: dict[str, dict[str, list[int]]] = {}
-    for index, row in enumerate(rows):
-        deformations = objects.setdefault(row["object"], {})
-        deformations.setdefault(deformation_of(row["name"]), []).append(index)
-    parts = [""] * len(rows)
-    for name, deformations in objects.items():
-        if len(deformations) < len(wanted):
-            raise DataError(
-                f"Splitting by deformation into {', '.join(wanted)} needs at least {len(wanted)} "
-                f"deformations of every object, found {len(deformations)} of {name!r}; provide "
-                "more, leave the object out, or split by object."
-            )
-        order = sorted(deformations, key=lambda group: digest([seed, "split", group]))
-        levels = [[rows[index]["level"] for index in deformations[group]] for group in order]
-        for group, part in zip(order, _share_levels(levels, wanted), strict=True):
-            for index in deformations[group]:
-                parts[index] = part
-    return parts
-
-
-def _share_levels(groups: list[list[float]], wanted: Mapping[str, float]) -> list[str]:
-    """The part of each group of one object's pairs, whose levels are given, in their order.
-
-    A group goes to the part that is farthest below its share of the pairs of these levels, and of
-    those of the object; the last ones go where nothing is yet.
-    """
-    total = Counter(level for levels in groups for level in levels)
-    counts: dict[str, Counter[float]] = {part: Counter() for part in wanted}
-    parts = []
-    for number, levels in enumerate(groups):
-        empty = [part for part in wanted if not counts[part]]
-        open_parts = empty if len(groups) - number <= len(empty) else list(wanted)
-        lacking = {
-            part: (
-                sum(wanted[part] * total[level] - counts[part][level] for level in levels),
-                wanted[part] * total.total() - counts[part].total(),
-            )
-            for part in open_parts
-        }
-        part = max(open_parts, key=lacking.__getitem__)
-        counts[part].update(levels)
-        parts.append(part)
-    return parts
-
-
-def _split_objects(objects: set[str], fractions: Mapping[str, float], seed: int) -> dict[str, str]:
-    """Share objects out by fraction, with at least one to each part that is not to be empty."""
-    wanted = {part: fraction for part, fraction in fractions.items() if fraction > 0}
-    if len(objects) < len(wanted):
-        raise DataError(
-            f"Splitting by object into {', '.join(wanted)} needs at least {len(wanted)} objects "
-            f"with usable pairs, found {len(objects)}; provide more objects, or set the share of a "
-            "split to 0."
-        )
-    counts = dict.fromkeys(wanted, 1)
-    for _ in range(len(objects) - len(wanted)):
-        # The next object goes to the part that is farthest below its share.
-        part = max(wanted, key=lambda part: wanted[part] * len(objects) - counts[part])
-        counts[part] += 1
-    shuffled = sorted(objects, key=lambda name: digest([seed, "split", name]))
-    parts = [part for part, count in counts.items() for _ in range(count)]
-    return dict(zip(shuffled, parts, strict=True))
-
-
-def _published_split(
-    rows: list[_Row],
-    published: Mapping[str, str],
-    fractions: Mapping[str, float],
-    seed: int,
-) -> tuple[list[str | None], dict[str, str | int]]:
-    """Part of each row, None where the split does not name it, and attributes about the split."""
-    # The level is part of an id, but a published split may name files without their folders.
-    candidates = [(row["name"], deformation_of(row["name"]), row["object"]) for row in rows]
-    parts = [
-        next((published[name] for name in names if name in published), None) for names in candidates
-    ]
-    unknown = sorted(set(published).difference(*candidates))
-    if unknown:
-        _log.warning(
-            "%d names in the published split fit no usable pair: %s%s",
-            len(unknown),
-            ", ".join(unknown[:5]),
-            ", ..." if len(unknown) > 5 else "",
-        )
-    objects = [row["object"] for row in rows]
-    homes: dict[str, set[str]] = {}
-    for name, part in zip(objects, parts, strict=True):
-        if part is not None:
-            homes.setdefault(name, set()).add(part)
-    leaking = sorted(name for name, where in homes.items() if len(where) > 1)
-    if leaking:
-        _log.warning(
-            "The published split has pairs of the same object in several parts, so results on "
-            "test pairs are not results on unseen objects; objects: %s",
-            ", ".join(leaking),
-        )
-    training = {name for name, where in homes.items() if "train" in where}
-    if training and fractions["val"] > 0 and "val" not in parts:
-        # An object that is tested on as well would leak into the choice of λ.
-        apart = training - set(leaking)
-        total = fractions["train"] + fractions["val"]
-        shares = {part: fractions[part] / total for part in ("train", "val")}
-        if len(apart) < len(shares):
-            apart = set()
-        carved = [
-            index
-            for index, part in enumerate(parts)
-            if part == "train" and objects[index] in (apart or training)
-        ]
-        by = "object"
-        if not apart:
-            # Where all (but one) are known, deformations of those that have several are not.
-            names = {(objects[index], deformation_of(rows[index]["name"])) for index in carved}
-            count = Counter(name for name, _ in names)
-            several = [index for index in carved if count[objects[index]] >= len(shares)]
-            by, carved = ("deformation", several) if several else (by, carved)
-        found = _share_out([rows[index] for index in carved], shares, by, seed)
-        for index, part in zip(carved, found, strict=True):
-            parts[index] = part
-    return parts, {
-        "split_rule": "published",
-        "split_leakage": ", ".join(leaking),
-        "split_unknown": len(unknown),
-    }

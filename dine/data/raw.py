@@ -12,14 +12,14 @@ deformed: same vertices and faces, same order, moved.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
 import logging
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -47,36 +47,18 @@ SYNTHETIC = "synthetic"
 _MAKER = "dine.data.raw"
 _GENERATORS = {"primitives": primitive, "tissue": tissue_patch}
 _VAIN_DRAWS = 1000
-_Named = tuple[str, Callable[[], Surface]]
 
 
-def write_dataset(
-    folder: str | os.PathLike,
-    bases: Iterable[tuple[str, Surface]],
-    *,
-    levels: Sequence[float],
-    control_percents: Sequence[float],
-    widths: Sequence[float],
-    amplitude: float,
-    points: int,
-    pairs_per_level: int,
-    seed: int,
-    origin: str,
-) -> None:
-    """Deform every object at every level and write the folder described at the top.
+@dataclass(frozen=True)
+class Deformations:
+    """How every object is deformed.
 
     Every object gets ``pairs_per_level`` targets per level, each with its own (a, b): first those
     of ``control_percents`` x ``widths`` in random order, then numbers drawn evenly from the ranges
     that the two lists span. The random numbers of a pair follow from (seed, object, level, number
     of the pair) alone: adding objects, levels or pairs changes no other file.
 
-    The folder appears under its name only when it is complete. One that is there already is kept
-    as it is if it was made from equal input, and otherwise replaced once the new one is complete.
-
-    Args:
-        folder: where to write.
-        bases: (name, undeformed surface in any unit). Characters in a name that are unsafe in
-            file names are replaced by '-'.
+    Attributes:
         levels: deformation levels, > 0.
         control_percents: percentages of control points, in (0, 100].
         widths: widths of the Gaussian in object radii, > 0.
@@ -84,130 +66,118 @@ def write_dataset(
         points: points per cloud, which the percentages refer to.
         pairs_per_level: targets per object and level.
         seed: seed of the dataset.
-        origin: ``SYNTHETIC``, or the path that real base objects come from.
 
     Raises:
         ValueError: a parameter outside its range, or repeated.
+    """
+
+    levels: Sequence[float]
+    control_percents: Sequence[float]
+    widths: Sequence[float]
+    amplitude: float
+    points: int
+    pairs_per_level: int
+    seed: int
+
+    def __post_init__(self):
+        for name in ("levels", "control_percents", "widths"):
+            object.__setattr__(self, name, _distinct(name, getattr(self, name)))
+        object.__setattr__(self, "amplitude", float(self.amplitude))
+        for level, percent, width in itertools.product(
+            self.levels, self.control_percents, self.widths
+        ):
+            check_recipe(
+                level=level,
+                control_percent=percent,
+                width=width,
+                amplitude=self.amplitude,
+                points=self.points,
+            )
+        if min(self.levels) == 0:
+            raise ValueError("levels must be above 0: a target at level 0 is its source.")
+        most = most_pairs_per_level(self.control_percents, self.widths)
+        if not 1 <= self.pairs_per_level <= most:
+            raise ValueError(
+                f"pairs_per_level must be 1 to {most:g}, the number of different deformations that "
+                f"control_percents and widths give, not {self.pairs_per_level}."
+            )
+
+    def targets(self, surface: Surface, name: str) -> Iterator[tuple[tuple[str, str], Surface]]:
+        """((level, <object>_<a>_<b>), deformed surface) of all pairs of one object."""
+        for level in self.levels:
+            for k, (percent, width) in enumerate(self.kernels(name, _text(level))):
+                field = rbf_displacement(
+                    surface,
+                    level=level,
+                    control_percent=percent,
+                    width=width,
+                    amplitude=self.amplitude,
+                    points=self.points,
+                    rng=_rng(self.seed, name, _text(level), k),
+                )
+                pair = f"{name}_{_text(percent)}_{_text(width)}"
+                moved = Surface(surface.vertices + field, surface.faces, name=f"target {pair}")
+                yield (_text(level), pair), moved
+
+    def kernels(self, name: str, level: str) -> list[tuple[float, float]]:
+        """(a, b) of all pairs of one object and level: no two would be written alike.
+
+        Raises:
+            ConfigError: percentages and widths too close together for so many pairs.
+        """
+        lists = (self.control_percents, self.widths)
+        grid = list(itertools.product(*lists))
+        rng = _rng(self.seed, name, level)
+        kernels = [grid[choice] for choice in rng.permutation(len(grid))]
+        written, vain = set(kernels), 0
+        while len(kernels) < self.pairs_per_level:
+            drawn = tuple(_rounded(rng.uniform(min(some), max(some))) for some in lists)
+            vain = vain + 1 if drawn in written else 0
+            if vain > _VAIN_DRAWS:
+                raise ConfigError(
+                    f"`pairs_per_level` is {self.pairs_per_level}, but `control_percents` and "
+                    f"`widths` lie so close together that only {len(kernels)} different "
+                    "deformations were found; widen one of the two."
+                )
+            if not vain:
+                written.add(drawn)
+                kernels.append(drawn)
+        return kernels[: self.pairs_per_level]
+
+
+def write_dataset(
+    folder: str | os.PathLike,
+    sources: Sequence[tuple[str, Callable[[], Surface]]],
+    deformations: Deformations,
+    origin: str,
+    identity: Any,
+) -> None:
+    """Deform every object at every level and write the folder described at the top.
+
+    The folder appears under its name only when it is complete. One that is there already is kept
+    as it is if it was made from equal input, and otherwise replaced once the new one is complete.
+
+    Args:
+        folder: where to write.
+        sources: the name of each object and what makes or reads its undeformed surface, in any
+            unit. Characters in a name that are unsafe in file names are replaced by '-'.
+        deformations: of every object.
+        origin: ``SYNTHETIC``, or the path that real base objects come from.
+        identity: stands for the content of all sources, so that it need not be made to find out
+            whether the folder is there already.
+
+    Raises:
         ConfigError: percentages and widths too close together for so many pairs.
         DataError: no object is usable (a single unusable one is left out, with a warning and its
             reason in provenance.json), or ``folder`` holds something that DINE did not make.
         StorageError: the folder cannot be written.
     """
-    surfaces = list(bases)
-    _write(
-        folder,
-        [(name, partial(_given, surface)) for name, surface in surfaces],
-        identity=[[name, _fingerprint(surface)] for name, surface in surfaces],
-        levels=levels,
-        control_percents=control_percents,
-        widths=widths,
-        amplitude=amplitude,
-        points=points,
-        pairs_per_level=pairs_per_level,
-        seed=seed,
-        origin=origin,
-    )
-
-
-def synthesise(
-    folder: str | os.PathLike,
-    kind: Literal["primitives", "tissue"],
-    objects: int,
-    first: int = 0,
-    **recipe: Any,
-) -> None:
-    """Write a fully synthetic dataset: ``objects`` objects, numbered from ``first``.
-
-    Args:
-        folder: where to write.
-        kind: "primitives" (like SynBench) or "tissue" (like DeformedTissue).
-        objects: number of objects, >= 1.
-        first: number of the first one; object i is the same in every dataset of equal seed.
-        recipe: the keywords of ``write_dataset`` except ``origin``.
-
-    Raises:
-        As ``write_dataset``.
-    """
-    if kind not in _GENERATORS:
-        raise ValueError(f"kind must be one of {', '.join(_GENERATORS)}, not {kind!r}.")
-    if objects < 1 or first < 0:
-        raise ValueError(f"objects must be at least 1 and first 0, not {objects} and {first}.")
-    generate = _GENERATORS[kind]
-    numbers = range(first, first + objects)
-    sources = [(f"{i:03d}", partial(generate, i, recipe["seed"])) for i in numbers]
-    identity = {"kind": kind, "objects": objects, "first": first}
-    _write(folder, sources, identity=identity, origin=SYNTHETIC, **recipe)
-
-
-def deform_bases(folder: str | os.PathLike, inventory: Inventory, **recipe: Any) -> None:
-    """Write a dataset of synthetic deformations of a user's own undeformed meshes or clouds.
-
-    Args:
-        folder: where to write.
-        inventory: what ``layout.scan`` found; its ``bases`` are deformed. They may differ in units,
-            be open, in several components or hold duplicate vertices.
-        recipe: the keywords of ``write_dataset`` except ``origin``.
-
-    Raises:
-        As ``write_dataset``.
-    """
-    sources = [(name, partial(read_surface, path)) for name, path in inventory.bases.items()]
-    identity = {name: _file_identity(path) for name, path in inventory.bases.items()}
-    origin = str(inventory.folder.resolve())
-    _write(folder, sources, identity=identity, origin=origin, **recipe)
-
-
-def _given(surface: Surface) -> Surface:
-    return surface
-
-
-def _fingerprint(surface: Surface) -> str:
-    faces = [] if surface.faces is None else surface.faces
-    arrays = (surface.vertices, np.asarray(faces, dtype=np.int64))
-    return digest([hashlib.sha256(np.ascontiguousarray(a)).hexdigest() for a in arrays])
-
-
-def _file_identity(path: Path) -> list[str]:
-    """Digests of the file and, for a SimTool ``.xyz``, of the file that holds its faces."""
-    parts = (path, path.with_suffix(".triangle"))
-    return [file_digest(part) for part in parts if os.access(part, os.R_OK) and part.is_file()]
-
-
-def _write(
-    folder: str | os.PathLike,
-    sources: list[_Named],
-    *,
-    identity: Any,
-    levels: Sequence[float],
-    control_percents: Sequence[float],
-    widths: Sequence[float],
-    amplitude: float,
-    points: int,
-    pairs_per_level: int,
-    seed: int,
-    origin: str,
-) -> None:
-    """``write_dataset`` for objects that are made or read one at a time.
-
-    ``identity`` stands for the content of all sources, so that it need not be made to find out
-    whether the folder is there already.
-    """
-    parameters = {
-        "levels": _distinct("levels", levels),
-        "control_percents": _distinct("control_percents", control_percents),
-        "widths": _distinct("widths", widths),
-        "amplitude": float(amplitude),
-        "points": int(points),
-        "pairs_per_level": int(pairs_per_level),
-        "seed": int(seed),
-    }
-    _check(parameters)
     key = {
         "made_by": _MAKER,
         "dine_version": __version__,
         "code": code_digest("raw"),
         "origin": origin,
-        "parameters": parameters,
+        "parameters": asdict(deformations),
         "bases": identity,
     }
     folder = Path(folder).resolve()
@@ -223,7 +193,7 @@ def _write(
             _remove(part)
             _remove(old)
             try:
-                _fill(part, sources, key)
+                _fill(part, sources, deformations, key)
                 if folder.exists():
                     os.replace(folder, old)
                 os.replace(part, folder)
@@ -237,34 +207,67 @@ def _write(
         ) from error
 
 
+def synthesise(
+    folder: str | os.PathLike,
+    deformations: Deformations,
+    kind: Literal["primitives", "tissue"],
+    objects: int,
+    first: int = 0,
+) -> None:
+    """Write a fully synthetic dataset: ``objects`` objects, numbered from ``first``.
+
+    Args:
+        folder: where to write.
+        deformations: of every object.
+        kind: "primitives" (like SynBench) or "tissue" (like DeformedTissue).
+        objects: number of objects, >= 1.
+        first: number of the first one; object i is the same in every dataset of equal seed.
+
+    Raises:
+        As ``write_dataset``; ValueError for another kind, or numbers out of range.
+    """
+    if kind not in _GENERATORS:
+        raise ValueError(f"kind must be one of {', '.join(_GENERATORS)}, not {kind!r}.")
+    if objects < 1 or first < 0:
+        raise ValueError(f"objects must be at least 1 and first 0, not {objects} and {first}.")
+    generate = _GENERATORS[kind]
+    numbers = range(first, first + objects)
+    sources = [(f"{i:03d}", partial(generate, i, deformations.seed)) for i in numbers]
+    identity = {"kind": kind, "objects": objects, "first": first}
+    write_dataset(folder, sources, deformations, SYNTHETIC, identity)
+
+
+def deform_bases(
+    folder: str | os.PathLike, deformations: Deformations, inventory: Inventory
+) -> None:
+    """Write a dataset of synthetic deformations of a user's own undeformed meshes or clouds.
+
+    Args:
+        folder: where to write.
+        deformations: of every object.
+        inventory: what ``layout.scan`` found; its ``bases`` are deformed. They may differ in units,
+            be open, in several components or hold duplicate vertices.
+
+    Raises:
+        As ``write_dataset``.
+    """
+    sources = [(name, partial(read_surface, path)) for name, path in inventory.bases.items()]
+    identity = {name: _file_identity(path) for name, path in inventory.bases.items()}
+    write_dataset(folder, sources, deformations, str(inventory.folder.resolve()), identity)
+
+
+def _file_identity(path: Path) -> list[str]:
+    """Digests of the file and, for a SimTool ``.xyz``, of the file that holds its faces."""
+    parts = (path, path.with_suffix(".triangle"))
+    return [file_digest(part) for part in parts if os.access(part, os.R_OK) and part.is_file()]
+
+
 def _distinct(name: str, values: Sequence[float]) -> list[float]:
     """The values as floats, refused if empty or if two would give the same file name."""
     values = [float(value) for value in values]
     if not values or len({_text(value) for value in values}) < len(values):
         raise ValueError(f"{name} must hold at least one value and none twice, not {values}.")
     return values
-
-
-def _check(parameters: dict[str, Any]) -> None:
-    grid = itertools.product(
-        parameters["levels"], parameters["control_percents"], parameters["widths"]
-    )
-    for level, control_percent, width in grid:
-        check_recipe(
-            level=level,
-            control_percent=control_percent,
-            width=width,
-            amplitude=parameters["amplitude"],
-            points=parameters["points"],
-        )
-    if min(parameters["levels"]) == 0:
-        raise ValueError("levels must be above 0: a target at level 0 is its source.")
-    most = most_pairs_per_level(parameters["control_percents"], parameters["widths"])
-    if not 1 <= parameters["pairs_per_level"] <= most:
-        raise ValueError(
-            f"pairs_per_level must be 1 to {most:g}, the number of different deformations that "
-            f"control_percents and widths give, not {parameters['pairs_per_level']}."
-        )
 
 
 def _text(number: float) -> str:
@@ -292,7 +295,12 @@ def _remove(folder: Path) -> None:
         shutil.rmtree(folder)
 
 
-def _fill(folder: Path, sources: list[_Named], key: dict[str, Any]) -> None:
+def _fill(
+    folder: Path,
+    sources: Sequence[tuple[str, Callable[[], Surface]]],
+    deformations: Deformations,
+    key: dict[str, Any],
+) -> None:
     """Write everything; provenance.json, by which a folder counts as made, comes last."""
     written: dict[str, str] = {}
     left_out: dict[str, str] = {}
@@ -304,7 +312,7 @@ def _fill(folder: Path, sources: list[_Named], key: dict[str, Any]) -> None:
                     f"its files would have the names of those of {written[safe]}; rename one."
                 )
             surface = load()
-            targets = dict(_targets(surface, safe, key["parameters"]))
+            targets = dict(deformations.targets(surface, safe))
         except DataError as error:
             left_out[name] = str(error)
             logger.warning("%s is left out: %s", name, error)
@@ -329,50 +337,6 @@ def _fill(folder: Path, sources: list[_Named], key: dict[str, Any]) -> None:
 def _safe(name: str) -> str:
     """The name with only letters, digits, '_', '-' and '.' (not in front, which would hide it)."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", name).lstrip(".") or "-"
-
-
-def _targets(
-    surface: Surface, name: str, parameters: dict[str, Any]
-) -> Iterator[tuple[tuple[str, str], Surface]]:
-    """((level, <object>_<a>_<b>), deformed surface) of all pairs of one object."""
-    seed = parameters["seed"]
-    for level in parameters["levels"]:
-        kernels = _kernels(parameters, seed, name, _text(level))
-        for k, (control_percent, width) in enumerate(kernels):
-            field = rbf_displacement(
-                surface,
-                level=level,
-                control_percent=control_percent,
-                width=width,
-                amplitude=parameters["amplitude"],
-                points=parameters["points"],
-                rng=_rng(seed, name, _text(level), k),
-            )
-            pair = f"{name}_{_text(control_percent)}_{_text(width)}"
-            moved = Surface(surface.vertices + field, surface.faces, name=f"target {pair}")
-            yield (_text(level), pair), moved
-
-
-def _kernels(parameters: dict[str, Any], *key: int | str) -> list[tuple[float, float]]:
-    """(a, b) of all pairs of one object and level: no two would be written alike."""
-    percents, widths = parameters["control_percents"], parameters["widths"]
-    grid = list(itertools.product(percents, widths))
-    rng = _rng(*key)
-    kernels = [grid[choice] for choice in rng.permutation(len(grid))]
-    written, vain = set(kernels), 0
-    while len(kernels) < parameters["pairs_per_level"]:
-        drawn = tuple(_rounded(rng.uniform(min(some), max(some))) for some in (percents, widths))
-        vain = vain + 1 if drawn in written else 0
-        if vain > _VAIN_DRAWS:
-            raise ConfigError(
-                f"`pairs_per_level` is {parameters['pairs_per_level']}, but `control_percents` "
-                f"and `widths` lie so close together that only {len(kernels)} different "
-                "deformations were found; widen one of the two."
-            )
-        if not vain:
-            written.add(drawn)
-            kernels.append(drawn)
-    return kernels[: parameters["pairs_per_level"]]
 
 
 def _rounded(number: float) -> float:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from dine.data.fields import put_names
 from dine.data.pairs import PairSet, read_pairs, read_variant_subset
 from dine.errors import ConfigError, DataError
-from dine.evaluation.predictions import read_predictions
+from dine.evaluation.predictions import Prediction, read_predictions
 from dine.evaluation.quality import correspondence
 from dine.files import atomic_path
 from dine.geometry.distance import chamfer, distance_measures, distances
@@ -22,6 +22,21 @@ from dine.geometry.folding import folding, neighbourhoods, roughness
 from dine.results import CLEAN, KNOWN, UNSEEN, condition_key
 
 POINT_ERRORS_FORMAT = "dine-point-errors"
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What is written into every row.
+
+    Attributes:
+        dataset: its name.
+        backbone: ``none`` for methods without one.
+        seed: of the training, where there was one.
+    """
+
+    dataset: str
+    backbone: str
+    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +64,68 @@ class _Known:
         )
 
 
+class _TestPairs:
+    """The test pairs of a file, and the targets that models saw in place of the clean ones.
+
+    Raises:
+        DataError: a file is missing, damaged or made from other pairs.
+    """
+
+    def __init__(self, path: Path, variants: list[Path]):
+        everything = read_pairs(path)
+        test = everything.split == "test"
+        self.path = path
+        self.pairs = everything.select(index=test)
+        self.position = {name: i for i, name in enumerate(self.pairs.name)}
+        self.observed: dict[str, dict[str, np.ndarray]] = {}
+        for variant_path in variants:
+            some, variant = read_variant_subset(variant_path, self.pairs)
+            key = condition_key(variant.condition, variant.level)
+            targets = dict(zip(some.name.tolist(), variant.target, strict=True))
+            self.observed[key] = targets
+        self._known_object, self._cluster = everything.known[test], everything.cluster[test]
+        self._measured_with: dict[int, _Known] = {}
+
+    def known(self, index: int) -> _Known:
+        """What a pair is measured with, computed once."""
+        if index not in self._measured_with:
+            self._measured_with[index] = _Known.of(self.pairs, index)
+        return self._measured_with[index]
+
+    def facts(self, index: int) -> dict[str, object]:
+        """The columns that say which pair it is."""
+        return {
+            "origin": str(self.pairs.attributes.get("origin", "unknown")),
+            "pair": self.pairs.name[index],
+            "object": self.pairs.object[index],
+            "objects": KNOWN if self._known_object[index] else UNSEEN,
+            "cluster": self._cluster[index],
+            "level": float(self.pairs.level[index]),
+        }
+
+    def seen(self, prediction: Prediction, path: Path) -> dict[str, np.ndarray] | None:
+        """The targets of a prediction's pairs by name; None where these are the clean ones.
+
+        Raises:
+            DataError: the prediction, read from ``path``, is not one of these pairs and targets.
+        """
+        names = prediction.pair.tolist()
+        _require(names, self.position, path, self.path)
+        targets = None
+        if prediction.condition != CLEAN:
+            key = condition_key(prediction.condition, prediction.corruption)
+            if key not in self.observed:
+                raise DataError(f"{path} has the condition {key}, but no variant file was given.")
+            targets = self.observed[key]
+            _require(names, targets, path, f"the variant file of {key}")
+        if prediction.displacement.shape[1:] != self.pairs.source.shape[1:]:
+            raise DataError(
+                f"{path} has fields of {prediction.displacement.shape[1]} points, but "
+                f"{self.path} has {self.pairs.source.shape[1]}."
+            )
+        return targets
+
+
 def evaluate(
     predictions: Mapping[str, Path],
     pairs_path: Path,
@@ -56,9 +133,7 @@ def evaluate(
     out: Path,
     point_errors: Path | None,
     *,
-    dataset: str,
-    backbone: str,
-    seed: int = 0,
+    labels: Labels,
 ) -> None:
     """Write one row per method, predicted test pair and condition, and the per-point errors.
 
@@ -76,9 +151,7 @@ def evaluate(
         out: one row per pair and condition.
         point_errors: squared distances of the moved points to the clean target, of a single
             method; None for no file.
-        dataset: written into every row, as are ``backbone`` and ``seed``.
-        backbone: ``none`` for methods without one.
-        seed: of the training, where there was one.
+        labels: of all rows.
 
     Raises:
         DataError: a file is missing, damaged or made from other pairs, or lacks what the
@@ -87,72 +160,49 @@ def evaluate(
     """
     if point_errors is not None and len(predictions) > 1:
         raise ConfigError("Per-point errors are written for one method at a time.")
-    everything = read_pairs(pairs_path)
-    test = everything.split == "test"
-    known_object, cluster = everything.known[test], everything.cluster[test]
-    pairs = everything.select(index=test)
-    position = {name: i for i, name in enumerate(pairs.name)}
-    observed = {}
-    for variant_path in variants:
-        some, variant = read_variant_subset(variant_path, pairs)
-        observed[condition_key(variant.condition, variant.level)] = dict(
-            zip(some.name.tolist(), variant.target, strict=True)
-        )
-    origin = str(pairs.attributes.get("origin", "unknown"))
-    known: dict[int, _Known] = {}
+    test = _TestPairs(pairs_path, variants)
     rows = []
     errors: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     found = [(m, path, p) for m, path in predictions.items() for p in read_predictions(path)]
     for method, path, prediction in found:
+        first = {"dataset": labels.dataset, "backbone": labels.backbone, "method": method}
+        first["seed"] = labels.seed
+        measured, squared = _rows(test, prediction, path)
+        rows += [first | row for row in measured]
         key = condition_key(prediction.condition, prediction.corruption)
-        names = prediction.pair.tolist()
-        _require(names, position, path, pairs_path)
-        targets = None
-        if prediction.condition != CLEAN:
-            if key not in observed:
-                raise DataError(f"{path} has the condition {key}, but no variant file was given.")
-            targets = observed[key]
-            _require(names, targets, path, f"the variant file of {key}")
-        if prediction.displacement.shape[1:] != pairs.source.shape[1:]:
-            raise DataError(
-                f"{path} has fields of {prediction.displacement.shape[1]} points, but "
-                f"{pairs_path} has {pairs.source.shape[1]}."
-            )
-        per_point = np.empty(prediction.displacement.shape[:2], np.float32)
-        for row, name in enumerate(names):
-            index = position[name]
-            if index not in known:
-                known[index] = _Known.of(pairs, index)
-            values, distance = _measure(
-                known[index],
-                prediction.displacement[row],
-                None if targets is None else targets[name].astype(np.float64),
-            )
-            per_point[row] = distance**2
-            rows.append(
-                {
-                    "dataset": dataset,
-                    "backbone": backbone,
-                    "method": method,
-                    "seed": seed,
-                    "origin": origin,
-                    "pair": name,
-                    "object": pairs.object[index],
-                    "objects": KNOWN if known_object[index] else UNSEEN,
-                    "cluster": cluster[index],
-                    "level": float(pairs.level[index]),
-                    "condition": prediction.condition,
-                    "corruption": prediction.corruption,
-                    **values,
-                    "mce_original": values["mce"] * float(pairs.scale[index]),
-                    "seconds": np.nan if prediction.seconds is None else prediction.seconds[row],
-                }
-            )
-        errors[key] = (prediction.pair, per_point)
+        errors[key] = (prediction.pair, squared)
     if point_errors is not None:
         _write_point_errors(point_errors, errors)
     with atomic_path(out) as temporary:
         pd.DataFrame(rows).to_csv(temporary, index=False, float_format="%.9g")
+
+
+def _rows(
+    test: _TestPairs, prediction: Prediction, path: Path
+) -> tuple[list[dict[str, object]], np.ndarray]:
+    """One row per pair of a prediction, read from ``path``, without its labels.
+
+    Also the squared distances (P, N), float32, of the moved points to the clean target.
+    """
+    seen = test.seen(prediction, path)
+    rows = []
+    squared = np.empty(prediction.displacement.shape[:2], np.float32)
+    for number, name in enumerate(prediction.pair.tolist()):
+        index = test.position[name]
+        target = None if seen is None else seen[name].astype(np.float64)
+        values, distance = _measure(test.known(index), prediction.displacement[number], target)
+        squared[number] = distance**2
+        rows.append(
+            {
+                **test.facts(index),
+                "condition": prediction.condition,
+                "corruption": prediction.corruption,
+                **values,
+                "mce_original": values["mce"] * float(test.pairs.scale[index]),
+                "seconds": np.nan if prediction.seconds is None else prediction.seconds[number],
+            }
+        )
+    return rows, squared
 
 
 def _write_point_errors(path: Path, errors: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:

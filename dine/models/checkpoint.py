@@ -170,11 +170,11 @@ def rebuilt(
         raise CheckpointError(
             f"{path} does not say how to build its {keys[0]} ({reason[:300]}); make it again."
         ) from error
-    load_state(module, state, path)
+    load_weights(module, state, path)
     return module
 
 
-def load_state(module: nn.Module, state: dict[str, torch.Tensor], path: str | Path) -> None:
+def load_weights(module: nn.Module, state: dict[str, torch.Tensor], path: str | Path) -> None:
     """Load a state dict strictly.
 
     Raises:

@@ -73,32 +73,47 @@ def diagnose(
     fields = torch.from_numpy(held_out).float()
     points = torch.from_numpy(sources).float()
     nll = -prior.log_prob(fields, points).mean().item()
-    found = {
+    drawn_on = sources if train_sources is None else train_sources
+    return {
         "nll": nll,
-        "nll_per_coordinate": None,
-        "nll_per_component": None,
-        "generalisation": None,
-        "specificity": _specificity(
-            prior, train, sources if train_sources is None else train_sources, seed
-        ),
-        "in_span": None,
-        "residual": None,
+        **_per_unit(prior, nll, held_out[0].size),
+        "generalisation": _generalisation(prior, fields, points),
+        "specificity": _specificity(prior, train, drawn_on, seed),
+        **_components(prior, fields),
     }
+
+
+def _per_unit(prior: Prior, nll: float, coordinates: int) -> dict[str, float | None]:
+    """The negative log-likelihood per coordinate of a field or per principal component."""
+    found = {"nll_per_coordinate": None, "nll_per_component": None}
+    whole = PCAResidualPrior | PCAProcessPrior | GaussianProcessPrior | SmoothnessPrior
     if isinstance(prior, FlowPrior):
         found["nll_per_coordinate"] = nll / 3
-    elif isinstance(
-        prior, PCAResidualPrior | PCAProcessPrior | GaussianProcessPrior | SmoothnessPrior
-    ):
-        found["nll_per_coordinate"] = nll / held_out[0].size
+    elif isinstance(prior, whole):
+        found["nll_per_coordinate"] = nll / coordinates
     elif isinstance(prior, PCAPrior):
         found["nll_per_component"] = nll / prior.shape["components"]
-    if isinstance(prior, PCAPrior):
-        found["generalisation"] = _distance(prior.projected(fields), fields).mean().item()
-        found["in_span"] = prior.mahalanobis(fields).mean().item() / prior.shape["components"]
-        found["residual"] = prior.residual(fields).mean().item() / held_out[0].size
-    if isinstance(prior, PCAProcessPrior | GaussianProcessPrior):
-        found["generalisation"] = _distance(prior.smoothed(fields, points), fields).mean().item()
     return found
+
+
+def _generalisation(prior: Prior, fields: Tensor, points: Tensor) -> float | None:
+    if isinstance(prior, PCAProcessPrior | GaussianProcessPrior):
+        closest = prior.smoothed(fields, points)
+    elif isinstance(prior, PCAPrior):
+        closest = prior.projected(fields)
+    else:
+        return None
+    return _distance(closest, fields).mean().item()
+
+
+def _components(prior: Prior, fields: Tensor) -> dict[str, float | None]:
+    """How far fields lie inside the span of the principal components, and outside."""
+    if not isinstance(prior, PCAPrior):
+        return {"in_span": None, "residual": None}
+    return {
+        "in_span": prior.mahalanobis(fields).mean().item() / prior.shape["components"],
+        "residual": prior.residual(fields).mean().item() / fields[0].numel(),
+    }
 
 
 def _distance(a: Tensor, b: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dine.config import FlowArguments
 from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, Sample, check_sizes
-from dine.priors.likelihood import Unfinished, maximise_likelihood
+from dine.priors.likelihood import Ascent, Unfinished, maximise_likelihood
 
 
 @PRIORS.register("flow")
@@ -60,16 +60,9 @@ class FlowPrior(Prior):
 
         count = min(given.batch_size, len(pool))
         optimiser = torch.optim.AdamW(prior.flow.parameters(), lr=given.learning_rate)
-        maximise_likelihood(
-            prior.flow,
-            prior._log_density,
-            draw,
-            optimiser,
-            steps=given.steps,
-            seed=seed,
-            schedule=torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, given.steps),
-            unfinished=unfinished,
-        )
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, given.steps)
+        ascent = Ascent(prior.flow, prior._log_density, optimiser, schedule)
+        maximise_likelihood(ascent, draw, steps=given.steps, seed=seed, unfinished=unfinished)
         prior.notes = {
             "samples": len(fields),
             "nll_train": -prior._log_density(pool[: 2**17]).mean().item(),

@@ -13,7 +13,7 @@ from dine.config import LatentFlowArguments
 from dine.errors import DataError
 from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian
-from dine.priors.likelihood import Best, Unfinished, maximise_likelihood
+from dine.priors.likelihood import Ascent, Best, Unfinished, maximise_likelihood
 from dine.priors.pca_residual import PCAResidualPrior
 from dine.priors.sources import held_out_folds, source_labels
 
@@ -91,16 +91,8 @@ class LatentFlowPrior(PCAResidualPrior):
         optimiser = torch.optim.AdamW(
             prior.flow.parameters(), lr=given.learning_rate, weight_decay=given.weight_decay
         )
-        maximise_likelihood(
-            prior.flow,
-            prior._log_density,
-            draw,
-            optimiser,
-            steps=given.steps,
-            seed=seed,
-            best=best,
-            unfinished=unfinished,
-        )
+        ascent = Ascent(prior.flow, prior._log_density, optimiser, best=best)
+        maximise_likelihood(ascent, draw, steps=given.steps, seed=seed, unfinished=unfinished)
         prior.notes |= {
             "held_out": int(np.count_nonzero(held)),
             "steps": best.step,

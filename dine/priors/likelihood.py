@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -73,29 +74,69 @@ class Best:
         self.value, self.step, self.weights = state["value"], state["step"], state["weights"]
 
 
+@dataclass(frozen=True, eq=False)
+class Ascent:
+    """What is stepped uphill, and how.
+
+    Attributes:
+        flow: whose parameters ``optimiser`` steps.
+        log_density: of rows (B, F), (B,).
+        optimiser: of the flow's parameters.
+        schedule: of the learning rate, a step at a time.
+        best: ends the fit early, and its weights are those the flow is left with.
+    """
+
+    flow: nn.Module
+    log_density: Callable[[Tensor], Tensor]
+    optimiser: torch.optim.Optimizer
+    schedule: LRScheduler | None = None
+    best: Best | None = None
+
+    def step(self, rows: Tensor) -> float:
+        """One step towards the highest mean log density of some rows; its loss."""
+        loss = -self.log_density(rows).mean()
+        self.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.flow.parameters(), CLIP)
+        self.optimiser.step()
+        if self.schedule is not None:
+            self.schedule.step()
+        return loss.item()
+
+    def is_done(self, step: int, steps: int) -> bool:
+        """Whether ``step`` is the last of at most ``steps``."""
+        last = step == steps
+        if self.best is not None and (last or step % self.best.every == 0):
+            return self.best.look(self.flow, step) or last
+        return last
+
+    def state_dict(self) -> dict[str, dict]:
+        return {name: part.state_dict() for name, part in self._parts().items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+
+    def _parts(self) -> dict[str, Any]:
+        names = ("flow", "optimiser", "schedule", "best")
+        return {name: part for name in names if (part := getattr(self, name)) is not None}
+
+
 def maximise_likelihood(
-    flow: nn.Module,
-    log_density: Callable[[Tensor], Tensor],
+    ascent: Ascent,
     draw: Callable[[torch.Generator], Tensor],
-    optimiser: torch.optim.Optimizer,
     *,
     steps: int,
     seed: int,
-    schedule: LRScheduler | None = None,
-    best: Best | None = None,
     unfinished: Unfinished | None = None,
 ) -> None:
     """Step a flow's parameters, in place, towards the highest mean log density of drawn rows.
 
     Args:
-        flow: whose parameters ``optimiser`` steps.
-        log_density: of rows (B, F), (B,).
+        ascent: the flow, its density and its optimiser.
         draw: a step's rows, with the numbers of the generator that it is given.
-        optimiser: steps.
         steps: at most so many.
         seed: of the generator.
-        schedule: of the learning rate, a step at a time.
-        best: ends the fit early, and its weights are those the flow is left with.
         unfinished: where the state is kept; on a CPU a fit that was stopped, however, goes on from
             there to the same parameters, bit for bit. None where it need not be kept.
 
@@ -104,54 +145,60 @@ def maximise_likelihood(
         DineError: another process fits in the folder.
     """
     generator = torch.Generator().manual_seed(seed)
-    parts = {"flow": flow, "optimiser": optimiser, "schedule": schedule, "best": best}
-    parts = {name: part for name, part in parts.items() if part is not None}
-    start = 0
     with contextlib.ExitStack() as stack:
-        stop = None
+        kept, start, name = None, 0, "fit"
         if unfinished is not None:
             stop = stack.enter_context(StopRequest())
             stack.enter_context(one_writer(unfinished.folder, unfinished.identity))
-            state, message = load_state(unfinished.state, unfinished.identity)
-            log.info("%s: %s", unfinished.name, message)
-            if state is not None:
-                for name, part in parts.items():
-                    part.load_state_dict(state[name])
-                generator.set_state(state["generator"])
-                start = state["step"]
-        name = "fit" if unfinished is None else unfinished.name
+            kept = _Kept(unfinished, ascent, generator, stop)
+            start, name = kept.resume(), unfinished.name
         progress = stack.enter_context(Progress(name, steps, start, quiet=unfinished is None))
-        saved = time.monotonic()
         for step in range(start + 1, steps + 1):
-            loss = -log_density(draw(generator)).mean()
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(flow.parameters(), CLIP)
-            optimiser.step()
-            if schedule is not None:
-                schedule.step()
-            progress.update(1, loss=loss.item())
-            last = step == steps
-            if best is not None and (last or step % best.every == 0):
-                last |= best.look(flow, step)
-            if last:
+            progress.update(1, loss=ascent.step(draw(generator)))
+            if ascent.is_done(step, steps):
                 break
-            stopping = stop is not None and stop.signal is not None
-            if unfinished is not None and (
-                stopping or time.monotonic() - saved > unfinished.save_seconds
-            ):
-                state = {name: part.state_dict() for name, part in parts.items()}
-                state |= {
-                    "identity": unfinished.identity,
-                    "step": step,
-                    "generator": generator.get_state(),
-                }
-                save_state(unfinished.state, state)
-                saved = time.monotonic()
-            if stopping:
-                raise Interrupted(
-                    f"{unfinished.name} was stopped after step {step} of {steps}; run the same "
-                    "command again to go on from there."
-                )
-    if best is not None:
-        flow.load_state_dict(best.weights)
+            if kept is not None:
+                kept.after(step, steps)
+    if ascent.best is not None:
+        ascent.flow.load_state_dict(ascent.best.weights)
+
+
+class _Kept:
+    """The state of a fit, saved now and then and when the fit is to stop."""
+
+    def __init__(
+        self, where: Unfinished, ascent: Ascent, generator: torch.Generator, stop: StopRequest
+    ):
+        self.where, self.ascent, self.generator, self.stop = where, ascent, generator, stop
+
+    def resume(self) -> int:
+        """Take over a saved state, if there is one of this fit; steps that are done."""
+        state, message = load_state(self.where.state, self.where.identity)
+        log.info("%s: %s", self.where.name, message)
+        self.saved = time.monotonic()
+        if state is None:
+            return 0
+        self.ascent.load_state_dict(state)
+        self.generator.set_state(state["generator"])
+        return state["step"]
+
+    def after(self, step: int, steps: int) -> None:
+        """Save after a step if that is due.
+
+        Raises:
+            Interrupted: the fit was asked to stop; the state is saved.
+        """
+        stopping = self.stop.signal is not None
+        if stopping or time.monotonic() - self.saved > self.where.save_seconds:
+            state = self.ascent.state_dict() | {
+                "identity": self.where.identity,
+                "step": step,
+                "generator": self.generator.get_state(),
+            }
+            save_state(self.where.state, state)
+            self.saved = time.monotonic()
+        if stopping:
+            raise Interrupted(
+                f"{self.where.name} was stopped after step {step} of {steps}; run the same "
+                "command again to go on from there."
+            )

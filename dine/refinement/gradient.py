@@ -42,7 +42,7 @@ _MOMENTUM = 0.9
 _MEMORY = 0.95
 
 
-class Objective(Protocol):
+class FieldObjective(Protocol):
     """A data term plus a weighted penalty, such as :class:`dine.training.objective.Objective`.
 
     ``prior`` is frozen, or None. A call gets a batch without edges in its graph, a displacement
@@ -61,7 +61,7 @@ def refine_by_gradient(
     source: np.ndarray,
     target: np.ndarray,
     displacement: np.ndarray,
-    objective: Objective,
+    objective: FieldObjective,
     *,
     steps: int = STEPS,
     learning_rate: float = LEARNING_RATE,

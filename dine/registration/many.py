@@ -27,7 +27,7 @@ _DONE = "done.json"
 
 
 @dataclass(frozen=True)
-class Job:
+class RegistrationJob:
     """One registration of many: a name for its files, and the two shapes."""
 
     name: str
@@ -35,7 +35,7 @@ class Job:
     target: Path
 
 
-def read_jobs(path: Path) -> list[Job]:
+def read_jobs(path: Path) -> list[RegistrationJob]:
     """The pairs of a manifest, or those found in a folder.
 
     A manifest is a CSV file with the columns ``source`` and ``target``, paths relative to it, and
@@ -47,12 +47,14 @@ def read_jobs(path: Path) -> list[Job]:
     if path.is_dir():
         inventory = scan(path)
         jobs = [
-            Job(f"{pair.level}_{pair.name}", pair.source, pair.target)
+            RegistrationJob(f"{pair.level}_{pair.name}", pair.source, pair.target)
             for pair in inventory.pairs
             if pair.condition == "deformation"
         ]
     else:
-        jobs = [Job(pair.name, pair.source, pair.target) for pair in read_manifest(path)]
+        jobs = [
+            RegistrationJob(pair.name, pair.source, pair.target) for pair in read_manifest(path)
+        ]
     if not jobs:
         raise DataError(f"{path} names no pairs of a source and a target.")
     repeated = [name for name, count in Counter(job.name for job in jobs).items() if count > 1]
@@ -65,14 +67,14 @@ def read_jobs(path: Path) -> list[Job]:
 
 
 def register_many(
-    jobs: list[Job],
+    jobs: list[RegistrationJob],
     out: Path,
     model: Model,
     *,
     suffix: str = "",
     view: bool = False,
     settings: dict | None = None,
-    load: Callable[[Job], dict] | None = None,
+    load: Callable[[RegistrationJob], dict] | None = None,
 ) -> pd.DataFrame:
     """Register every pair into a folder of its own; what is done already is not done again.
 
@@ -110,13 +112,13 @@ def register_many(
 
 
 def _one(
-    job: Job,
+    job: RegistrationJob,
     folder: Path,
     model: Model,
     suffix: str,
     view: bool,
     settings: dict,
-    load: Callable[[Job], dict] | None,
+    load: Callable[[RegistrationJob], dict] | None,
 ) -> dict:
     for path in (job.source, job.target):
         if not os.path.isfile(path):

@@ -10,7 +10,7 @@ import numpy as np
 from dine.errors import DataError
 from dine.evaluation.conditions import Condition, evaluation_conditions
 from dine.evaluation.predictions import Prediction, read_predictions
-from dine.reporting.figures import Example, qualitative_figure, save_figure
+from dine.reporting.figures import ExamplePair, qualitative_figure, save_figure
 from dine.reporting.names import display_name, setting_name
 from dine.results import CLEAN
 
@@ -65,7 +65,7 @@ def draw_examples(
     save_figure(figure, out.with_suffix(""))
 
 
-def typical(condition: Condition, fields: Mapping[str, Prediction]) -> Example:
+def typical(condition: Condition, fields: Mapping[str, Prediction]) -> ExamplePair:
     """The pair with the median error of the first method, with what all of them made of it."""
     pairs = condition.pairs
     truth = pairs.target - pairs.source
@@ -76,7 +76,7 @@ def typical(condition: Condition, fields: Mapping[str, Prediction]) -> Example:
     mean = errors[next(iter(fields))].mean(axis=1)
     row = rows[np.argsort(mean[rows], kind="stable")[(len(rows) - 1) // 2]]
     label = f"{setting_name(condition.name, condition.corruption)}\nlevel {pairs.level[row]:g}"
-    return Example(
+    return ExamplePair(
         label,
         pairs.source[row],
         pairs.target[row],

@@ -214,7 +214,7 @@ def histogram_figure(errors: Mapping[str, np.ndarray], title: str, origin: str) 
 
 
 @dataclass(frozen=True)
-class Example:
+class ExamplePair:
     """One test pair for the qualitative figure.
 
     Attributes:
@@ -264,7 +264,7 @@ def load_examples(
     pairs: PairSet,
     predictions: Mapping[str, str | os.PathLike],
     point_errors: Mapping[str, str | os.PathLike],
-) -> list[Example]:
+) -> list[ExamplePair]:
     """Gather the clouds of ``pick_examples``; the two mappings give one file per method.
 
     Errors are squared distances to the clean target, in the unit of the tables.
@@ -280,7 +280,9 @@ def load_examples(
             registered[method] = source + displacement[_find(known, pair, path)]
             known, squared = read_group(point_errors[method], key, "squared_distance")
             errors[method] = CD_SCALE * squared[_find(known, pair, point_errors[method])]
-        examples.append(Example(label, source, np.asarray(pairs.target[index]), registered, errors))
+        examples.append(
+            ExamplePair(label, source, np.asarray(pairs.target[index]), registered, errors)
+        )
     return examples
 
 
@@ -292,7 +294,7 @@ def _find(listed: np.ndarray, pair: str, where: Any) -> int:
 
 
 def qualitative_figure(
-    examples: Sequence[Example],
+    examples: Sequence[ExamplePair],
     title: str,
     origin: str,
     *,
@@ -332,7 +334,7 @@ def qualitative_figure(
 
 
 def _example_row(
-    line: Sequence[Any], example: Example, methods: Sequence[str], norm: Normalize
+    line: Sequence[Any], example: ExamplePair, methods: Sequence[str], norm: Normalize
 ) -> None:
     centre, rotation = _principal_frame(example.source)
     source, target = ((x - centre) @ rotation for x in (example.source, example.target))

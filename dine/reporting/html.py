@@ -62,7 +62,7 @@ Item = str | list | dict | Table | Picture | Part | Beside | Folded
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A part of the page that its contents name, in ``short``; without items it is left out."""
 
     name: str
@@ -76,7 +76,7 @@ def write_page(
     title: str,
     intro: Sequence[str],
     banners: Sequence[Mapping[str, Any]],
-    sections: Sequence[Section],
+    sections: Sequence[PageSection],
 ) -> Path:
     """Write a page; all text is escaped.
 

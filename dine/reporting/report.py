@@ -17,9 +17,9 @@ from dine.reporting.effects import effects, headlines, overview
 from dine.reporting.html import (
     Beside,
     Item,
+    PageSection,
     Part,
     Picture,
-    Section,
     as_yaml,
     banners,
     grid,
@@ -72,7 +72,7 @@ def build_report(results: Path, config: Config, out: Path) -> None:
         *result_sections(run.metrics, pictures, config.evaluation.training_spread),
         lambda_section(searches, chosen),
         agreement_section(agreement),
-        Section("how", "How it was made", _made(run, config)),
+        PageSection("how", "How it was made", _made(run, config)),
     ]
     write_page(out, "DINE report", INTRO, banners(run.metrics, published=True), sections)
 
@@ -81,7 +81,7 @@ def result_sections(
     metrics: pd.DataFrame,
     pictures: Mapping[str, Sequence[tuple[str, Picture]]] | None = None,
     spread: float = 0.0,
-) -> list[Section]:
+) -> list[PageSection]:
     """Findings, tables and figures; a figure whose numbers a table holds stands beside it.
 
     Args:
@@ -104,9 +104,9 @@ def result_sections(
     control = effects(metrics, spread=spread)
     findings = [headlines(control, metrics), overview(control, metrics, spread=spread)]
     return [
-        Section("findings", "Findings", findings),
-        Section("tables", "Tables", tables),
-        Section("figures", "Figures", figures),
+        PageSection("findings", "Findings", findings),
+        PageSection("tables", "Tables", tables),
+        PageSection("figures", "Figures", figures),
     ]
 
 
@@ -119,7 +119,7 @@ def _table_of(figure: str) -> str | None:
 
 def lambda_section(
     searches: Sequence[Mapping[str, Any]], pictures: Sequence[Picture] = ()
-) -> Section:
+) -> PageSection:
     """Per prior: the choice, its validation errors and those of the λ = 0 control."""
     rows = []
     for search in searches:
@@ -134,15 +134,15 @@ def lambda_section(
     header = ["Dataset", "Backbone", "Prior", "Chosen λ", "CD ×10⁻⁴", "Correspondence error"]
     header += ["CD ×10⁻⁴ at λ = 0", "Correspondence error at λ = 0"]
     items = [_LAMBDA, grid(header, rows), *pictures] if rows else []
-    return Section("lambda", "Choice of λ", items)
+    return PageSection("lambda", "Choice of λ", items)
 
 
-def agreement_section(agreement: Sequence[Mapping[str, Any]]) -> Section:
+def agreement_section(agreement: Sequence[Mapping[str, Any]]) -> PageSection:
     """How well point i means the same place across pairs; a row for each dataset."""
     frame = pd.DataFrame(agreement)
     table = grid([str(name) for name in frame], frame.itertuples(index=False))
     title = "Do point indices agree across pairs?"
-    return Section("indices", title, [_INDICES, table], short="Point indices")
+    return PageSection("indices", title, [_INDICES, table], short="Point indices")
 
 
 def _made(run: Run, config: Config) -> list[Item | None]:

@@ -4,6 +4,6 @@ What the data terms are registered by is imported here, so that every one is kno
 """
 
 from dine.training.data_terms import DATA_TERMS, DataTerm
-from dine.training.unrolled import Refined
+from dine.training.unrolled import RefinedTerm
 
-__all__ = ["DATA_TERMS", "DataTerm", "Refined"]
+__all__ = ["DATA_TERMS", "DataTerm", "RefinedTerm"]

@@ -84,7 +84,7 @@ def spread(count: int, wanted: int) -> np.ndarray:
 
 
 @torch.no_grad()
-def validate(backbone: Backbone, batches: Batches, wanted: int) -> dict[str, float]:
+def validation_errors(backbone: Backbone, batches: Batches, wanted: int) -> dict[str, float]:
     """Mean Chamfer distance, correspondence error and roughness over some validation pairs."""
     backbone.eval()
     values = []
@@ -127,7 +127,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainingJob:
     """One training, apart from the network and the pairs.
 
     Attributes:
@@ -153,7 +153,7 @@ class Job:
 
 def train(
     backbone: Backbone,
-    job: Job,
+    job: TrainingJob,
     seen: Seen,
     validated: Seen,
     *,
@@ -206,7 +206,7 @@ def _train(
     team: Team,
     *,
     backbone: Backbone,
-    job: Job,
+    job: TrainingJob,
     seen: Seen,
     validated: Seen,
     on_step: Callable[[int], None] | None,
@@ -224,7 +224,7 @@ def _train(
 class _Trainer:
     """One process's network and optimiser, and what was measured so far."""
 
-    def __init__(self, team: Team, backbone: Backbone, job: Job):
+    def __init__(self, team: Team, backbone: Backbone, job: TrainingJob):
         self.team, self.backbone, self.job = team, backbone, job
         self.history: list[dict[str, Any]] = []
         backbone.to(team.device).train()
@@ -287,7 +287,9 @@ class _Trainer:
                 last = step + 1 == settings.steps
                 if team.leads:
                     if last or (step + 1) % settings.validate_every == 0:
-                        row |= validate(self.backbone, validated, settings.validation_pairs)
+                        row |= validation_errors(
+                            self.backbone, validated, settings.validation_pairs
+                        )
                     progress.update(1, loss=np.mean([r["loss"] for r in self.history[-50:]]))
                     if on_step is not None:
                         on_step(step)

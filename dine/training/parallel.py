@@ -191,14 +191,13 @@ def _start(devices: list[torch.device], nodes: Nodes, work: Callable[[Team], Any
     context = multiprocessing.get_context("spawn")
     stop = context.RawValue("b", 0)
     reader, writer = context.Pipe(duplex=False)
-    arguments = (
+    part = _Part(
         devices,
         nodes if nodes.port else nodes._replace(port=_free_port()),
         max(1, torch.get_num_threads() // count),
         stop,
         writer,
         logging.getLogger().level,
-        # Not left to torch, which would have all processes train the same weights in one memory.
         pickle.dumps(work),
     )
     died = None
@@ -206,7 +205,7 @@ def _start(devices: list[torch.device], nodes: Nodes, work: Callable[[Team], Any
     listener = threading.Thread(target=_listen, args=(reader, errors))
     with StopRequest() as request:
         with _signals_held_back():
-            team = start_processes(_take_part, arguments, count, join=False, start_method="spawn")
+            team = start_processes(_take_part, (part,), count, join=False, start_method="spawn")
         writer.close()
         listener.start()
         try:
@@ -267,32 +266,38 @@ class _ToParent(logging.handlers.QueueHandler):
         self.queue.send(record)
 
 
-def _take_part(
-    rank: int,
-    devices: list[torch.device],
-    nodes: Nodes,
-    threads: int,
-    stop: Any,
-    writer: Connection,
-    level: int,
-    work: bytes,
-) -> None:
+class _Part(NamedTuple):
+    """What the processes of a node are given; ``work`` pickled by us.
+
+    Left to torch, it would have all processes train the same weights in one memory.
+    """
+
+    devices: list[torch.device]
+    nodes: Nodes
+    threads: int
+    stop: Any
+    writer: Connection
+    level: int
+    work: bytes
+
+
+def _take_part(rank: int, given: _Part) -> None:
     """What each process runs."""
     os.environ |= {
-        "MASTER_ADDR": nodes.address,
-        "MASTER_PORT": str(nodes.port),
+        "MASTER_ADDR": given.nodes.address,
+        "MASTER_PORT": str(given.nodes.port),
         "LOCAL_RANK": str(rank),
-        "NODE_RANK": str(nodes.rank),
-        "OMP_NUM_THREADS": str(threads),  # else Fabric sets its own number
+        "NODE_RANK": str(given.nodes.rank),
+        "OMP_NUM_THREADS": str(given.threads),  # else Fabric sets its own number
     }
-    torch.set_num_threads(threads)
-    if rank == 0 and nodes.rank == 0:
-        logging.getLogger().setLevel(level)
-        logging.getLogger().addHandler(_ToParent(writer))
+    torch.set_num_threads(given.threads)
+    if rank == 0 and given.nodes.rank == 0:
+        logging.getLogger().setLevel(given.level)
+        logging.getLogger().addHandler(_ToParent(given.writer))
     try:
-        pickle.loads(work)(Member(devices, nodes, stop))
+        pickle.loads(given.work)(Member(given.devices, given.nodes, given.stop))
     except DineError as error:
         with contextlib.suppress(OSError):  # the parent is dead
-            writer.send(error)
+            given.writer.send(error)
         if not isinstance(error, Interrupted):  # which all agree on
             raise

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from dine.config import CONTROL, Compute, LambdaSearch, Stage2
+from dine.config import CONTROL, LambdaSearch, Stage2
 from dine.errors import ConfigError, DataError
 from dine.files import file_digest, read_json, write_json
 from dine.models.checkpoint import load_backbone
-from dine.models.inference import COMPUTE
 from dine.priors import load_prior
 from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import VALIDATION_COLUMNS
 from dine.training.objective import Objective
-from dine.training.stages import Order, run
+from dine.training.stages import Order, Start, run
 
 
 def selected_lambda(path: Path, prior: str) -> float:
@@ -40,14 +41,11 @@ def stage2(
     pairs: Path,
     model: Path,
     settings: Stage2,
+    order: Order,
     *,
     variant: str,
     prior: Path | None,
     weight: float,
-    seed: int,
-    out: Path,
-    name: str,
-    compute: Compute = COMPUTE,
 ) -> None:
     """Refine a Stage-1 model with λ times a frozen prior.
 
@@ -63,14 +61,12 @@ def stage2(
         "prior": file_digest(prior) if prior else None,
         "lambda": weight,
     }
-    run(
-        backbone,
-        Objective(DATA_TERMS.get(settings.data_term)(), penalised, weight),
-        settings,
-        Order("stage2", seed, out, name, compute, described),
-        [pairs],
-        inputs,
-    )
+    objective = Objective(DATA_TERMS.get(settings.data_term)(), penalised, weight)
+    run(Start("stage2", backbone, objective, inputs, described), settings, order, [pairs])
+
+
+Errors = dict[str, float]
+"""Mean errors on validation pairs, by name."""
 
 
 def search_lambda(
@@ -79,65 +75,36 @@ def search_lambda(
     priors: dict[str, Path],
     stage: Stage2,
     search: LambdaSearch,
-    *,
-    seed: int,
-    out: Path,
-    compute: Compute = COMPUTE,
+    order: Order,
 ) -> None:
     """Try each λ on a shortened Stage 2 and choose by the criterion's mean on validation pairs.
 
     ``best_lambda`` chooses; where its choice lies at the edge of the grid, the grid goes on
     there, at most ``search.extend`` times for each prior. λ = 0 is trained too, once, for
     comparison, but never chosen. Each candidate's result is kept, so that an interrupted
-    search goes on with the next one.
+    search goes on with the next one. The result, ``order.out``, is a file (JSON).
     """
-    # One validation, at the end, on more pairs than training looks at.
-    settings = stage.model_copy(
-        update={
-            "steps": search.steps,
-            "warmup": round(stage.warmup * search.steps / stage.steps),
-            "validate_every": search.steps,
-            "validation_pairs": search.validation_pairs,
-        }
-    )
-    folder = out.with_name(f"{out.stem}_candidates")
+    settings = _shortened(stage, search)
+    folder = order.out.with_name(f"{order.out.stem}_candidates")
 
-    def errors(prior: str, weight: float) -> dict[str, float]:
-        here = folder / f"{prior}_{weight:g}"
-        stage2(
-            pairs,
-            model,
-            settings,
-            variant=prior,
-            prior=priors.get(prior),
-            weight=weight,
-            seed=seed,
-            out=here,
-            name=f"search of λ: {prior} {weight:g}",
-            compute=compute,
-        )
-        final = read_json(Network(here).record)["final"]
+    def errors(prior: str, weight: float) -> Errors:
+        name = f"{prior}_{weight:g}"
+        asked = replace(order, out=folder / name, name=f"{order.name}: {prior} {weight:g}")
+        file = priors.get(prior)
+        stage2(pairs, model, settings, asked, variant=prior, prior=file, weight=weight)
+        final = read_json(Network(asked.out).record)["final"]
         return {name.removeprefix("val_"): final[name] for name in VALIDATION_COLUMNS}
-
-    def best(tried: dict[float, dict[str, float]]) -> float:
-        means = {weight: found[search.criterion] for weight, found in tried.items()}
-        return best_lambda(means, search.tolerance)
 
     control = errors(CONTROL, 0.0)
     curve, selected = [], {}
     for prior in priors:
-        tried = {weight: errors(prior, weight) for weight in sorted(search.candidates)}
-        for _ in range(search.extend):
-            further = beyond_the_edge(list(tried), best(tried))
-            if further is None:
-                break
-            tried[further] = errors(prior, further)
-        selected[prior] = best(tried)
+        tried = _tried(partial(errors, prior), search)
+        selected[prior] = _best(tried, search)
         # The control is every prior's value at λ = 0.
         rows = {0.0: control, **dict(sorted(tried.items()))}
         curve += [{"prior": prior, "lambda": weight, **found} for weight, found in rows.items()]
     write_json(
-        out,
+        order.out,
         {
             "dataset": search.dataset,
             "backbone": search.backbone,
@@ -148,9 +115,37 @@ def search_lambda(
             "curve": curve,
             "steps": search.steps,
             "validation_pairs": search.validation_pairs,
-            "seed": seed,
+            "seed": order.seed,
         },
     )
+
+
+def _shortened(stage: Stage2, search: LambdaSearch) -> Stage2:
+    """Stage 2 of a candidate: one validation, at the end, on more pairs than training looks at."""
+    return stage.model_copy(
+        update={
+            "steps": search.steps,
+            "warmup": round(stage.warmup * search.steps / stage.steps),
+            "validate_every": search.steps,
+            "validation_pairs": search.validation_pairs,
+        }
+    )
+
+
+def _tried(errors: Callable[[float], Errors], search: LambdaSearch) -> dict[float, Errors]:
+    """The errors of every λ of the grid, and of those that it goes on with."""
+    tried = {weight: errors(weight) for weight in sorted(search.candidates)}
+    for _ in range(search.extend):
+        further = beyond_the_edge(list(tried), _best(tried, search))
+        if further is None:
+            break
+        tried[further] = errors(further)
+    return tried
+
+
+def _best(tried: Mapping[float, Errors], search: LambdaSearch) -> float:
+    means = {weight: found[search.criterion] for weight, found in tried.items()}
+    return best_lambda(means, search.tolerance)
 
 
 def best_lambda(means: Mapping[float, float], tolerance: float) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dine.config import Compute, Stage1, Training
+from dine.config import BackboneConfig, Compute, Stage1, Training
 from dine.data.pairs import PairSet, read_seen
 from dine.errors import CheckpointError, ConfigError
 from dine.files import digest, file_digest, write_json, write_text
@@ -22,7 +22,7 @@ from dine.models.state import check_still_wanted
 from dine.provenance import code_digest, run_record
 from dine.results import Network
 from dine.training.data_terms import DATA_TERMS
-from dine.training.loop import Job, Seen, history_csv, train
+from dine.training.loop import Seen, TrainingJob, history_csv, train
 from dine.training.objective import Objective
 
 
@@ -64,56 +64,58 @@ class Order:
     """Who asks for a training, and where its results go.
 
     Attributes:
-        step: the command whose code a saved state is bound to, with that of the classes picked by
-            name.
         seed: of initial weights and of the order of pairs.
         out: the folder of the results.
         name: shown with the progress.
         compute: how to compute.
+    """
+
+    seed: int
+    out: Path
+    name: str
+    compute: Compute = COMPUTE
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a training starts from.
+
+    Attributes:
+        step: the command whose code a saved state is bound to, with that of the classes picked by
+            name.
+        backbone: trained in place.
+        objective: what is minimised.
+        inputs: digests of what the start depends on.
         facts: for the record.
     """
 
     step: str
-    seed: int
-    out: Path
-    name: str
-    compute: Compute
+    backbone: Backbone
+    objective: Objective
+    inputs: dict[str, Any]
     facts: dict[str, Any]
 
 
 def run(
-    backbone: Backbone,
-    objective: Objective,
+    start: Start,
     settings: Training,
     order: Order,
     pairs: list[Path],
-    inputs: dict[str, Any],
     targets: list[Path] | None = None,
 ) -> None:
     """Train and write ``model.safetensors``, ``history.csv`` and ``run.json``.
 
-    ``inputs`` are digests of what the start depends on. Where there are other targets, every pair
-    is trained on twice: with its own and with that.
+    Where there are other targets, every pair is trained on twice: with its own and with that.
     """
-    compute, name = order.compute, order.name
-    inputs = {"pairs": [file_digest(path) for path in pairs], **inputs}
+    compute, name, backbone = order.compute, order.name, start.backbone
+    inputs = {"pairs": [file_digest(path) for path in pairs], **start.inputs}
     if targets:
         inputs["targets"] = [file_digest(path) for path in targets]
-    classes = [backbone.registered_name, settings.data_term]
-    if objective.prior is not None:
-        classes.append(objective.prior.registered_name)
-    identity = {
-        "settings": digest(settings.model_dump()),
-        "backbone": digest([backbone.registered_name, backbone.arguments]),
-        "seed": str(order.seed),
-        "precision": compute.precision,
-        "inputs": digest(inputs),
-        "code": code_digest(order.step, *classes),
-    }
+    identity = _identity(start, settings, order, inputs)
     seen = _twice(Seen(*read_seen(pairs, targets, "train")))
     validated = Seen(*read_seen(pairs, targets, "val"))
     backbone.precision = compute.precision
-    job = Job(objective, settings, order.seed, order.out / "training", identity, name)
+    job = TrainingJob(start.objective, settings, order.seed, order.out / "training", identity, name)
     began = time.monotonic()
     history = train(
         backbone, job, seen, validated, device=compute.device, processes=compute.processes
@@ -132,16 +134,39 @@ def run(
         "wall_seconds": time.monotonic() - began,
         "final": {k: v for k, v in history[-1].items() if k != "step"},
     }
-    computed = {
+    computed = _computed(compute)
+    record = run_record(
+        settings.model_dump(), order.seed, name=name, **computed, **measured, **start.facts
+    )
+    write_json(made.record, record)
+
+
+def _identity(
+    start: Start, settings: Training, order: Order, inputs: dict[str, Any]
+) -> dict[str, str]:
+    """Digests that a saved state must share to be used."""
+    backbone, prior = start.backbone, start.objective.prior
+    classes = [backbone.registered_name, settings.data_term]
+    if prior is not None:
+        classes.append(prior.registered_name)
+    return {
+        "settings": digest(settings.model_dump()),
+        "backbone": digest([backbone.registered_name, backbone.arguments]),
+        "seed": str(order.seed),
+        "precision": order.compute.precision,
+        "inputs": digest(inputs),
+        "code": code_digest(start.step, *classes),
+    }
+
+
+def _computed(compute: Compute) -> dict[str, Any]:
+    """How it was computed, for the record."""
+    return {
         "device": str(chosen_device(compute.device)),
         "processes": compute.processes,
         "precision": compute.precision,
         "threads": torch.get_num_threads(),
     }
-    record = run_record(
-        settings.model_dump(), order.seed, name=name, **computed, **measured, **order.facts
-    )
-    write_json(made.record, record)
 
 
 def _twice(seen: Seen) -> Seen:
@@ -152,55 +177,31 @@ def _twice(seen: Seen) -> Seen:
     return Seen(PairSet.concatenate([seen.pairs, seen.pairs]), targets)
 
 
-def stage1(
-    pairs: Path,
-    kind: str,
-    arguments: dict[str, Any],
-    settings: Stage1,
-    *,
-    seed: int,
-    out: Path,
-    name: str,
-    compute: Compute = COMPUTE,
-) -> None:
+def stage1(pairs: Path, backbone: BackboneConfig, settings: Stage1, order: Order) -> None:
     """Train a backbone on the data term alone."""
-    backbone = starting_backbone(kind, arguments, settings.start, seed)
-    start = settings.start
+    start, kind = settings.start, backbone.kind
+    network = starting_backbone(kind, backbone.arguments, start, order.seed)
     if start != "random":
         start = file_digest(shipped_weights(kind) if start == "pretrained" else start)
-    facts = {"stage": 1, "backbone": kind, "arguments": backbone.arguments}
-    run(
-        backbone,
-        Objective(DATA_TERMS.get(settings.data_term)()),
-        settings,
-        Order("stage1", seed, out, name, compute, facts),
-        [pairs],
-        {"start": start},
-    )
+    facts = {"stage": 1, "backbone": kind, "arguments": network.arguments}
+    objective = Objective(DATA_TERMS.get(settings.data_term)())
+    run(Start("stage1", network, objective, {"start": start}, facts), settings, order, [pairs])
 
 
 def pretrain(
     pairs: list[Path],
-    kind: str,
-    arguments: dict[str, Any],
+    backbone: BackboneConfig,
     settings: Training,
-    *,
-    seed: int,
-    out: Path,
+    order: Order,
     targets: list[Path] | None = None,
-    compute: Compute = COMPUTE,
 ) -> None:
     """Train weights to start from, on the true displacements of synthetic pairs.
 
     ``targets`` are variants of all pairs of each file, such as resampled ones, to train on as well.
     """
+    kind, arguments = backbone.kind, backbone.arguments
     facts = {"stage": 0, "backbone": kind, "data": "synthetic", "arguments": arguments}
-    run(
-        new_backbone(kind, arguments, seed),
-        Objective(DATA_TERMS.get(settings.data_term)()),
-        settings,
-        Order("pretrain", seed, out, f"pretraining/{kind}", compute, facts),
-        pairs,
-        {"start": "random"},
-        targets,
-    )
+    network = new_backbone(kind, arguments, order.seed)
+    objective = Objective(DATA_TERMS.get(settings.data_term)())
+    start = Start("pretrain", network, objective, {"start": "random"}, facts)
+    run(start, settings, order, pairs, targets)

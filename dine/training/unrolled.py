@@ -31,7 +31,7 @@ _LEAST_EXPONENT = -60.0
 
 
 @DATA_TERMS.register("refined")
-class Refined(DataTerm):
+class RefinedTerm(DataTerm):
     """Symmetric squared Chamfer distance of the refined field.
 
     A round costs N·M operations for the assignment and N·r² for the solve, for r dimensions of the

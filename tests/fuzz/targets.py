@@ -27,10 +27,10 @@ import yaml
 from samples import make_pairs
 
 from dine import config
-from dine.cli import _alignment
+from dine.cli.registration import _alignment
 from dine.data import pairs as pairs_module
 from dine.data.corruption import make_variant
-from dine.data.dataverse import download
+from dine.data.dataverse import Fetching, download
 from dine.data.fields import TrainingFields, read_fields, write_training_fields
 from dine.data.layout import scan
 from dine.data.obtain import obtained
@@ -564,7 +564,9 @@ def dataverse(path: Path) -> None:
     folder = path.parent / "place"
     before = {entry.name for entry in path.parent.iterdir()}
     try:
-        found = download("10.1/X", folder, session=Session(path.read_bytes()), retries=0)
+        found = download(
+            "10.1/X", folder, session=Session(path.read_bytes()), how=Fetching(retries=0)
+        )
         assert all(file.is_file() for file in found)
     finally:
         outcome(folder, before)
@@ -576,7 +578,7 @@ def archive(label: str) -> Callable[[Path], None]:
         before = {entry.name for entry in path.parent.iterdir()}
         session = Session(listing(label), path.read_bytes())
         try:
-            download("10.1/X", folder, session=session, retries=0)
+            download("10.1/X", folder, session=session, how=Fetching(retries=0))
         finally:
             outcome(folder, before)
 

@@ -5,7 +5,7 @@ verdicts. A *place* is a dataset with a backbone. Methods without a network are 
 of their datasets.
 """
 
-from dine.reporting.evidence.comparisons import Evidence, load_evidence
-from dine.reporting.evidence.report import Example, Files, build_evidence
+from dine.reporting.evidence.comparisons import EvidenceStatistics, load_evidence
+from dine.reporting.evidence.report import ExamplePicture, Files, build_evidence
 
-__all__ = ["Evidence", "Example", "Files", "build_evidence", "load_evidence"]
+__all__ = ["EvidenceStatistics", "ExamplePicture", "Files", "build_evidence", "load_evidence"]

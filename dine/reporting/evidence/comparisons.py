@@ -45,7 +45,7 @@ def load_evidence(paths: Iterable[Path]) -> pd.DataFrame:
 
 
 @dataclass(frozen=True)
-class Method:
+class ReportedMethod:
     """A method as the report shows it."""
 
     name: str
@@ -60,7 +60,7 @@ class Method:
 
 def _known_methods(
     present: Sequence[str], described: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Method]:
+) -> dict[str, ReportedMethod]:
     """The methods of the metrics in the order of the tables."""
     found = []
     for name in dict.fromkeys([*(n for n in described if n in present), *present]):
@@ -72,12 +72,12 @@ def _known_methods(
                 f"{', '.join(GROUPS)}."
             )
         title, text = str(entry.get("title") or name), str(entry.get("description") or "")
-        found.append(Method(name, title, group, text))
+        found.append(ReportedMethod(name, title, group, text))
     order = list(GROUPS)
     return {m.name: m for m in sorted(found, key=lambda m: order.index(m.group))}
 
 
-class Evidence:
+class EvidenceStatistics:
     """The statistics behind the report, each computed once and only when it is asked for.
 
     A *place* is a dataset with a backbone.

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from dine.config import STAGE1
 from dine.evaluation.statistics import NO_BACKBONE
-from dine.reporting.evidence.comparisons import GROUPS, LARGE, PAPER_PRIOR, Evidence, at
+from dine.reporting.evidence.comparisons import GROUPS, LARGE, PAPER_PRIOR, EvidenceStatistics, at
 from dine.reporting.figures import method_styles, new_figure, plain, plain_axes
 from dine.reporting.names import VALUES, display_name, signed
 
@@ -29,7 +29,7 @@ _MARKERS = "o^sDvP*X<>phd"
 _BESIDE = {"loc": "outside right upper", "fontsize": 8, "frameon": False}
 
 
-def forest_figure(evidence: Evidence, place: tuple[str, str]) -> Figure | None:
+def forest_figure(evidence: EvidenceStatistics, place: tuple[str, str]) -> Figure | None:
     """Relative difference of the mean at large levels to the reference, one row per method."""
     data = at(evidence.large, place)
     methods = [name for name in evidence.rivals if (data["method"] == name).any()]
@@ -93,7 +93,7 @@ def _forest_row(axes: Any, y: int, row: pd.Series, colour: str, reach: float) ->
     )  # fmt: skip
 
 
-def main_methods(evidence: Evidence, dataset: str) -> list[str]:
+def main_methods(evidence: EvidenceStatistics, dataset: str) -> list[str]:
     """Few enough to tell their lines apart: the paper's, and the best of each other group."""
     places = [place for place in evidence.judged if place[0] == dataset]
 
@@ -110,7 +110,7 @@ def main_methods(evidence: Evidence, dataset: str) -> list[str]:
     return list(dict.fromkeys(picked))
 
 
-def level_figure(evidence: Evidence, dataset: str) -> Figure | None:
+def level_figure(evidence: EvidenceStatistics, dataset: str) -> Figure | None:
     """Mean correspondence error of the main methods over levels; beneath, against the reference."""
     means = evidence.by_level
     methods = main_methods(evidence, dataset)
@@ -159,7 +159,7 @@ def level_figure(evidence: Evidence, dataset: str) -> Figure | None:
     return figure
 
 
-def plausibility_figure(evidence: Evidence, dataset: str) -> Figure | None:
+def plausibility_figure(evidence: EvidenceStatistics, dataset: str) -> Figure | None:
     """Accuracy against roughness and folding, one point per method and backbone."""
     shown = [n for n in evidence.methods if n in (evidence.reference, *evidence.rivals)]
     means = evidence.pooled

@@ -14,7 +14,7 @@ from dine.errors import DataError
 from dine.files import read_json
 from dine.provenance import versions
 from dine.reporting.effects import training_chance
-from dine.reporting.evidence.comparisons import LARGE, Evidence, load_evidence
+from dine.reporting.evidence.comparisons import LARGE, EvidenceStatistics, load_evidence
 from dine.reporting.evidence.figures import forest_figure, level_figure, plausibility_figure
 from dine.reporting.evidence.tables import (
     HIGHER,
@@ -32,8 +32,8 @@ from dine.reporting.html import (
     Beside,
     Folded,
     Item,
+    PageSection,
     Picture,
-    Section,
     as_yaml,
     banners,
     grid,
@@ -94,7 +94,7 @@ LIMITS = [
 
 
 @dataclass(frozen=True)
-class Example:
+class ExamplePicture:
     """A drawn PNG to show; the dataset says where its data come from."""
 
     dataset: str
@@ -118,7 +118,7 @@ class Files:
     metrics: Sequence[Path]
     searches: Sequence[Path] = ()
     diagnostics: Sequence[Path] = ()
-    examples: Sequence[Example] = ()
+    examples: Sequence[ExamplePicture] = ()
 
 
 def build_evidence(
@@ -148,15 +148,15 @@ def build_evidence(
     settings = config.get("evidence") or {}
     aside = [*(settings.get("backbones") or {}), *(settings.get("test_sets") or {})]
     spread = (config.get("evaluation") or {}).get("training_spread", Evaluation().training_spread)
-    evidence = Evidence(load_evidence(files.metrics), methods, reference, aside, spread)
+    evidence = EvidenceStatistics(load_evidence(files.metrics), methods, reference, aside, spread)
     page = _Page(evidence, out / "figures")
     sections = [
         *page.results(),
         page.plausibility(_read_all(files.searches, "backbone curve", evidence)),
-        Section("seeds", "Seeds", [seed_table(evidence)]),
+        PageSection("seeds", "Seeds", [seed_table(evidence)]),
         page.priors(_read_all(files.diagnostics, "backbone prior", evidence)),
         page.examples(files.examples),
-        Section("methods", "Methods", _methods(evidence, config)),
+        PageSection("methods", "Methods", _methods(evidence, config)),
     ]
     write_tables(_tables([item for section in sections for item in section.items]), out / "tables")
     write_numbers(evidence.comparisons, out / "tables" / "comparisons.csv")
@@ -168,7 +168,7 @@ def build_evidence(
 class _Page:
     """The sections of the page; figures are saved on the way."""
 
-    def __init__(self, evidence: Evidence, folder: Path):
+    def __init__(self, evidence: EvidenceStatistics, folder: Path):
         self.evidence = evidence
         self.folder = folder
 
@@ -177,13 +177,13 @@ class _Page:
             return None
         return Picture(caption, save_figure(figure, self.folder / name)[0])
 
-    def results(self) -> list[Section]:
+    def results(self) -> list[PageSection]:
         evidence, places = self.evidence, self.evidence.places
         made = any(evidence.origin(d) in ("synthetic", "bases") for d in evidence.datasets)
         corrupted = [mean_table(evidence, p, v, corrupted=True) for p in places for v in VALUES]
         every = [answer_table(evidence, p, v, by_level=True) for p in places for v in VALUES]
         return [
-            Section(
+            PageSection(
                 "short",
                 "In short",
                 [
@@ -195,7 +195,7 @@ class _Page:
                     Folded("Words and marks on this page", [WORDS]),
                 ],
             ),
-            Section(
+            PageSection(
                 "main",
                 "Every method at every level",
                 [
@@ -204,7 +204,7 @@ class _Page:
                 ],
                 short="By level",
             ),
-            Section(
+            PageSection(
                 "answer",
                 "Better than the reference?",
                 [
@@ -215,7 +215,7 @@ class _Page:
                 ],
                 short="Against the reference",
             ),
-            Section(
+            PageSection(
                 "corrupted",
                 "Noise, outliers and other points",
                 [
@@ -248,7 +248,7 @@ class _Page:
         tables = [answer_table(evidence, place, value) for value in VALUES]
         return Beside([*tables, self._drawn(f"effects_{slug(*place)}", caption, figure)])
 
-    def plausibility(self, searches: Sequence[Mapping[str, Any]]) -> Section:
+    def plausibility(self, searches: Sequence[Mapping[str, Any]]) -> PageSection:
         evidence = self.evidence
         items: list[Item | None] = [
             "A prior is to make fields plausible without making them wrong. Roughness near that of "
@@ -272,9 +272,9 @@ class _Page:
             figure = search_figure(some, where, evidence.origin(place[0]), titles)
             items.append(self._drawn(f"lambda_{slug(*place)}", caption, figure))
         shown = items if any(items[1:]) else []
-        return Section("plausibility", "Accuracy against plausibility", shown, "Plausibility")
+        return PageSection("plausibility", "Accuracy against plausibility", shown, "Plausibility")
 
-    def priors(self, found: Sequence[Mapping[str, Any]]) -> Section:
+    def priors(self, found: Sequence[Mapping[str, Any]]) -> PageSection:
         evidence = self.evidence
         items: list[Item | None] = [
             diagnostics_table(evidence, [{k: v for k, v in x.items() if k != "png"} for x in found])
@@ -287,25 +287,27 @@ class _Page:
                 )
                 prior = evidence.title(prior) if prior in evidence.methods else display_name(prior)
                 items.append(Picture(f"{where}: samples of {prior}.", record["png"]))
-        return Section("priors", "The priors themselves", items, "Priors")
+        return PageSection("priors", "The priors themselves", items, "Priors")
 
-    def examples(self, examples: Sequence[Example]) -> Section:
+    def examples(self, examples: Sequence[ExamplePicture]) -> PageSection:
         for example in examples:
             _check_dataset(example.dataset, example.png, self.evidence)
         pictures = [
             Picture(f"{self.evidence.where(x.dataset)}: {x.caption}", x.png) for x in examples
         ]
-        return Section("examples", "Examples", pictures)
+        return PageSection("examples", "Examples", pictures)
 
 
-def _methods(evidence: Evidence, config: Mapping[str, Any]) -> list[Item | None]:
+def _methods(evidence: EvidenceStatistics, config: Mapping[str, Any]) -> list[Item | None]:
     texts = {f"{m.title} ({m.kind})": m.description for m in evidence.methods.values()}
     packages = grid(["Package", "Version"], versions().items())
     shown = [Folded("Configuration", [as_yaml(config)])] if config else []
     return [texts, Folded("Versions", [packages]), *shown]
 
 
-def _read_all(paths: Sequence[Path], needed: str, evidence: Evidence) -> list[dict[str, Any]]:
+def _read_all(
+    paths: Sequence[Path], needed: str, evidence: EvidenceStatistics
+) -> list[dict[str, Any]]:
     """Records of datasets that the metrics have, with the picture beside as ``png``."""
     found = []
     for path in map(Path, paths):
@@ -319,7 +321,7 @@ def _read_all(paths: Sequence[Path], needed: str, evidence: Evidence) -> list[di
     return found
 
 
-def _check_dataset(dataset: str, path: Path, evidence: Evidence) -> None:
+def _check_dataset(dataset: str, path: Path, evidence: EvidenceStatistics) -> None:
     if dataset not in evidence.datasets:
         raise DataError(f"{path} is of {dataset}, of which there are no metrics.")
 

@@ -12,7 +12,7 @@ from dine.data.pairs import RESAMPLED
 from dine.evaluation.statistics import NO_BACKBONE
 from dine.reporting import names
 from dine.reporting.effects import verdict_cell
-from dine.reporting.evidence.comparisons import LARGE, Evidence, at
+from dine.reporting.evidence.comparisons import LARGE, EvidenceStatistics, at
 from dine.reporting.names import (
     DASH,
     MARKS,
@@ -47,7 +47,7 @@ _DIAGNOSED = {
 }
 
 
-def _methods(evidence: Evidence, methods: Iterable[str]) -> Columns:
+def _methods(evidence: EvidenceStatistics, methods: Iterable[str]) -> Columns:
     """The first columns: what kind of method, and which."""
     methods = list(methods)
     reference = {evidence.reference: " (reference)"}
@@ -57,7 +57,7 @@ def _methods(evidence: Evidence, methods: Iterable[str]) -> Columns:
     }
 
 
-def _all_data(evidence: Evidence, datasets: Iterable[str] | None = None) -> str:
+def _all_data(evidence: EvidenceStatistics, datasets: Iterable[str] | None = None) -> str:
     return join([evidence.where(name) for name in datasets or evidence.datasets])
 
 
@@ -72,7 +72,7 @@ def _marked(text: str, verdict: Any) -> str:
 # --------------------------------------------------------------------------------- in short
 
 
-def basis_table(evidence: Evidence) -> Table:
+def basis_table(evidence: EvidenceStatistics) -> Table:
     """What everything rests on: the test pairs and trainings of each dataset."""
     networks = evidence.clean[evidence.clean["backbone"] != NO_BACKBONE]
     seeds = networks.groupby(["dataset", "backbone", "method"])["seed"].nunique()
@@ -105,7 +105,7 @@ def basis_table(evidence: Evidence) -> Table:
     return Table("basis", title, caption, **laid_out(columns), data=data.reset_index())
 
 
-def verdict_table(evidence: Evidence, place: Place) -> Table:
+def verdict_table(evidence: EvidenceStatistics, place: Place) -> Table:
     """Lower, higher or undecided: every method against the reference at a place."""
     data = pd.concat([evidence.overall(place, condition) for condition in (CLEAN, RESAMPLED)])
     data = data[data["method"].isin(evidence.rivals)]
@@ -134,7 +134,7 @@ def verdict_table(evidence: Evidence, place: Place) -> Table:
     )
 
 
-def goal_table(evidence: Evidence) -> Table | None:
+def goal_table(evidence: EvidenceStatistics) -> Table | None:
     """Whether a method is significantly better at all large levels, and which is the best."""
     goal = evidence.goal
     if goal.empty:
@@ -177,7 +177,7 @@ def goal_table(evidence: Evidence) -> Table | None:
     )
 
 
-def _ranked(evidence: Evidence, value: str) -> list[Cell]:
+def _ranked(evidence: EvidenceStatistics, value: str) -> list[Cell]:
     """The mean at large levels of the reference and every rival, with the change in percent."""
     methods = [evidence.reference, *evidence.rivals]
     means = evidence.ranking(methods, value)
@@ -196,7 +196,7 @@ def _ranked(evidence: Evidence, value: str) -> list[Cell]:
 
 
 def mean_table(
-    evidence: Evidence, place: Place, value: str, *, corrupted: bool = False
+    evidence: EvidenceStatistics, place: Place, value: str, *, corrupted: bool = False
 ) -> Table | None:
     """Means of a value by method at a place: by level, or with imperfect targets."""
     _, name, scale, decimals = VALUES[value]
@@ -260,7 +260,7 @@ def _pooled(rows: Sequence[Row]) -> Columns:
 
 
 def _mean_caption(
-    evidence: Evidence, place: Place, value: str, shown: pd.DataFrame, corrupted: bool
+    evidence: EvidenceStatistics, place: Place, value: str, shown: pd.DataFrame, corrupted: bool
 ) -> str:
     where, long = evidence.where(*place), VALUES[value][0]
     if corrupted:
@@ -282,7 +282,7 @@ def _mean_caption(
 
 
 def answer_table(
-    evidence: Evidence, place: Place, value: str, *, by_level: bool = False
+    evidence: EvidenceStatistics, place: Place, value: str, *, by_level: bool = False
 ) -> Table | None:
     """Every method against the reference at a place: all levels together, or each."""
     long, name, scale, decimals = VALUES[value]
@@ -330,7 +330,7 @@ def _difference(row: Row, decimals: int, scale: float) -> str:
     return text if pd.isna(row["ci_low"]) else f"{text} [{', '.join(ends)}]"
 
 
-def seed_table(evidence: Evidence) -> Table | None:
+def seed_table(evidence: EvidenceStatistics) -> Table | None:
     """How much trainings differ, beside how much pairs differ."""
     data = evidence.pooled[evidence.pooled["seeds"] > 1]
     if data.empty:
@@ -358,7 +358,7 @@ def seed_table(evidence: Evidence) -> Table | None:
     )
 
 
-def diagnostics_table(evidence: Evidence, found: Sequence[Row]) -> Table | None:
+def diagnostics_table(evidence: EvidenceStatistics, found: Sequence[Row]) -> Table | None:
     """What ``diagnose`` found about each prior on fields that were not used for the fit."""
     if not found:
         return None

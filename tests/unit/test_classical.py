@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dine.classical.bcpd import Options, bcpd
+from dine.classical.bcpd import Parameters, bcpd
 from dine.classical.methods import CLASSICAL
 from dine.errors import ConfigError, DataError
 
@@ -162,7 +162,7 @@ def test_bcpd_does_what_the_paper_says(rounds):
     target = bent(source) @ Rotation.from_euler("z", 5, degrees=True).as_matrix().T
     target = standardised(np.random.default_rng(0).permutation(target)[:110])
     expected = literal_bcpd(source, target, beta=1.5, lam=10.0, omega=0.1, rounds=rounds)
-    options = Options(beta=1.5, lam=10.0, outliers=0.1, iterations=rounds, tolerance=1e-30)
+    options = Parameters(beta=1.5, lam=10.0, outliers=0.1, iterations=rounds, tolerance=1e-30)
     found = bcpd(source, target, options)
     assert found.iterations == rounds
     np.testing.assert_allclose(found.moved, expected, atol=1e-3)
@@ -171,7 +171,7 @@ def test_bcpd_does_what_the_paper_says(rounds):
 def test_bcpd_finds_rotation_and_size(pair):
     source = pair[0]
     target = 1.4 * Rotation.from_euler("z", 20, degrees=True).apply(source) + [0.3, 0, -0.1]
-    found = bcpd(source, target, Options(lam=1e6, uncertain=False))
+    found = bcpd(source, target, Parameters(lam=1e6, uncertain=False))
     np.testing.assert_allclose(found.moved, target, atol=1e-2)
     assert found.sigma < 0.05
 
@@ -179,7 +179,7 @@ def test_bcpd_finds_rotation_and_size(pair):
 def test_bcpd_knows_points_without_a_match(pair):
     source, target = pair
     seen = target[:, 2] > -0.25
-    options = Options(beta=1.0, lam=50.0, kappa=1.0, uncertain=False)
+    options = Parameters(beta=1.0, lam=50.0, kappa=1.0, uncertain=False)
     found = bcpd(source, target[seen], options)
     assert found.matched[seen].mean() > 3 * found.matched[~seen].mean()
 

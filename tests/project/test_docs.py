@@ -21,7 +21,7 @@ from dine.config import Dataset, Pairs, Recipe, Split
 from dine.data.obtain import obtain
 from dine.data.prepare import prepare_pairs
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 SHELL = {"", "sh", "bash", "console"}

@@ -9,7 +9,7 @@ from dine.errors import ConfigError
 from dine.refinement.em import Mixture
 from dine.refinement.process import STIFF, Smoothness
 from dine.refinement.refine import Observed, Options, refine
-from dine.training.unrolled import Refined
+from dine.training.unrolled import RefinedTerm
 
 pytestmark = pytest.mark.numerical
 
@@ -46,7 +46,7 @@ def batch_of(found, dtype=torch.float64):
 @pytest.mark.parametrize("rounds", [1, 2, 4])
 def test_rounds_are_those_of_the_refinement(rounds):
     found = [scans((120, 150)), scans((90, 170), seed=1)]
-    refined = Refined(rounds=rounds).refined(*batch_of(found))
+    refined = RefinedTerm(rounds=rounds).refined(*batch_of(found))
     for (source, target, field), result in zip(found, refined.numpy(), strict=True):
         model = Mixture(source, target, STIFF.at(source), STIFF.least, 0)
         expected, _ = model.most_probable(field, np.full(len(source), 1 / 0.1**2))
@@ -65,14 +65,14 @@ def test_a_network_without_marginals_is_smoothed_alike():
     observed = Observed.of_network(field, None)
     expected = refine(source, target, observed, options=Options(rounds=0)).mean
     batch, displacement = batch_of([(source, target, field)])
-    found = Refined(rounds=0).refined(batch, displacement)[0]
+    found = RefinedTerm(rounds=0).refined(batch, displacement)[0]
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)
 
 
 def test_gradient_follows_finite_differences():
     """Through assignment, variance and solve, beside padding and outliers."""
     batch, field = batch_of([scans((9, 20)), scans((6, 30), seed=1)])
-    term = Refined(rounds=2)
+    term = RefinedTerm(rounds=2)
     assert torch.autograd.gradcheck(
         lambda field: term(batch, field, None), field.requires_grad_(), atol=1e-8, rtol=1e-5
     )
@@ -87,7 +87,7 @@ def test_every_round_reaches_the_gradient():
     batch, field = batch_of([scans((60, 60))])
     field.requires_grad_()
     norms = [
-        torch.autograd.grad(Refined(rounds=rounds)(batch, field, None).sum(), field)[0].norm()
+        torch.autograd.grad(RefinedTerm(rounds=rounds)(batch, field, None).sum(), field)[0].norm()
         for rounds in range(4)
     ]
     assert all(norm > 1e-6 for norm in norms)
@@ -95,7 +95,7 @@ def test_every_round_reaches_the_gradient():
 
 def test_single_precision_suffices():
     found = [scans((200, 220))]
-    term = Refined()
+    term = RefinedTerm()
     values, gradients = [], []
     for dtype in (torch.float32, torch.float64):
         batch, field = batch_of(found, dtype)
@@ -115,7 +115,7 @@ def test_what_refinement_mends_costs_little():
     wrong = source @ np.diag([-2.0, -2.0, 0.0])  # half a turn
 
     def cost(field):
-        return Refined()(*batch_of([(source, target, field)]), None).item()
+        return RefinedTerm()(*batch_of([(source, target, field)]), None).item()
 
     assert cost(noisy) < 0.01 * cost(wrong)
 
@@ -126,7 +126,7 @@ def test_a_source_is_prepared_once(monkeypatch):
     monkeypatch.setattr(
         Smoothness, "at", lambda self, points: prepared.append(len(points)) or at(self, points)
     )
-    term = Refined()
+    term = RefinedTerm()
     first, second = batch_of([scans((30, 30))]), batch_of([scans((40, 30), seed=1)])
     for batch, field in (first, second, first, second):
         term(batch, field, None)
@@ -138,6 +138,6 @@ def test_a_source_is_prepared_once(monkeypatch):
 
 def test_arguments_are_checked():
     with pytest.raises(ConfigError, match="rounds must not be negative, found -1"):
-        Refined(rounds=-1)
+        RefinedTerm(rounds=-1)
     with pytest.raises(ConfigError, match="deviation must be positive, found 0"):
-        Refined(deviation=0)
+        RefinedTerm(deviation=0)

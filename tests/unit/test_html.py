@@ -111,7 +111,7 @@ def full_page(tmp_path, figure, metrics):
     more = [
         report.lambda_section([search]),
         report.agreement_section([{"dataset": "liver", "Median distance": 0.123456, "Pairs": 12}]),
-        html.Section(
+        html.PageSection(
             "how",
             "How it was made",
             [
@@ -285,7 +285,7 @@ def test_overview_has_a_column_for_every_condition():
 
 
 def test_the_page_shows_effects_their_chance_and_where_they_were_made(tmp_path):
-    made = html.Section("how", "How", [html.grid(["What", "Value"], [("CPU", "a <chip>")])])
+    made = html.PageSection("how", "How", [html.grid(["What", "Value"], [("CPU", "a <chip>")])])
     words = Page(page(tmp_path, even(-0.5), more=[made], spread=0.05)).words
     assert "higher: +50 % (+40 to +60)" in words
     assert "varies by 5 % of the reference" in words
@@ -295,7 +295,7 @@ def test_the_page_shows_effects_their_chance_and_where_they_were_made(tmp_path):
 
 @pytest.mark.parametrize("address", ["https://example.org/x.csv", "//example.org", "/etc/x"])
 def test_links_must_be_relative(tmp_path, address):
-    links = html.Section("files", "Files", [html.Part("links", {"x": address})])
+    links = html.PageSection("files", "Files", [html.Part("links", {"x": address})])
     with pytest.raises(DataError, match="only by a relative path"):
         page(tmp_path, made_up(0.25), more=[links])
     assert not (tmp_path / "report.html").exists()
@@ -304,7 +304,7 @@ def test_links_must_be_relative(tmp_path, address):
 def test_figures_must_be_png(tmp_path):
     def with_figure(name):
         picture = html.Picture("", tmp_path / name)
-        page(tmp_path, made_up(0.25), more=[html.Section("x", "X", [picture])])
+        page(tmp_path, made_up(0.25), more=[html.PageSection("x", "X", [picture])])
 
     with pytest.raises(DataError, match=r"none\.png cannot be read"):
         with_figure("none.png")

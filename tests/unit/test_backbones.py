@@ -13,7 +13,7 @@ from dine.models import compiled
 from dine.models.backbones import BACKBONES
 
 pytestmark = pytest.mark.numerical
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 SEEDS = {"robust_defreg": 1, "deftransnet": 2}
 SIZES = ("256x256", "200x330")
 

@@ -193,7 +193,7 @@ def test_meshes_without_faces_are_clouds(tmp_path, name, text):
 
 # --- VTK --------------------------------------------------------------------------------------
 
-SAMPLES = Path(__file__).parent / "data" / "vtk"
+SAMPLES = Path(__file__).parents[1] / "data" / "vtk"
 """Written by VTK; see ``write.py`` there."""
 GRID = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0.5], [3, 0, 1], [3, 1, 1], [2, 2, 0.5]]
 GRID += [[9, 9, 9]]

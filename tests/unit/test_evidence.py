@@ -12,8 +12,8 @@ from test_html import Page
 from dine.errors import DataError
 from dine.evaluation import statistics
 from dine.reporting.evidence import (
-    Evidence,
-    Example,
+    EvidenceStatistics,
+    ExamplePicture,
     Files,
     build_evidence,
     figures,
@@ -104,7 +104,7 @@ def written(metrics, folder):
 
 
 def compared(*args, **options):
-    return Evidence(made_up(*args, **options), METHODS)
+    return EvidenceStatistics(made_up(*args, **options), METHODS)
 
 
 def shown(table):
@@ -204,13 +204,13 @@ def test_files_that_contradict_each_other_are_refused(tmp_path):
 def test_reference_and_groups_are_checked(tmp_path):
     metrics = made_up({"pca": 1.0, "gp": 1.0}, datasets=("d",), backbones=("b",), seeds=1)
     with pytest.raises(DataError, match="reference 'lambda0'; they have pca, gp"):
-        Evidence(metrics, {})
+        EvidenceStatistics(metrics, {})
     with pytest.raises(DataError, match="pca has the unknown group 'magic'"):
-        Evidence(metrics, {"pca": {"group": "magic"}}, "gp")
+        EvidenceStatistics(metrics, {"pca": {"group": "magic"}}, "gp")
     with pytest.raises(DataError, match="no method to compare with 'gp'"):
-        Evidence(metrics[metrics["method"] == "gp"], {}, "gp")
-    assert Evidence(metrics, {}, "gp").methods["pca"].title == "pca"
-    assert Evidence(metrics, {}, "gp").methods["pca"].kind == "Other"
+        EvidenceStatistics(metrics[metrics["method"] == "gp"], {}, "gp")
+    assert EvidenceStatistics(metrics, {}, "gp").methods["pca"].title == "pca"
+    assert EvidenceStatistics(metrics, {}, "gp").methods["pca"].kind == "Other"
 
 
 # ----------------------------------------------------------------------------------- findings
@@ -222,7 +222,7 @@ def evidence(tmp_path_factory):
     # Targets were corrupted on one of the datasets only.
     metrics = metrics[(metrics["condition"] == "deformation") | (metrics["dataset"] == "synbench")]
     paths = written(metrics, tmp_path_factory.mktemp("metrics"))
-    return Evidence(load_evidence(paths), METHODS)
+    return EvidenceStatistics(load_evidence(paths), METHODS)
 
 
 def test_verdicts_where_the_goal_is_reached(evidence):
@@ -268,7 +268,7 @@ def test_the_chance_of_the_training_widens_intervals_and_undecides():
     metrics = made_up({"lambda0": 1.0, "pca": 0.9}, datasets=("synbench",), seeds=1)
     place = ("synbench", "deftransnet")
     for spread, said in ((0.0, "lower: −10 % "), (0.1, "undecided: −10 % (−30 to +10)")):
-        evidence = Evidence(metrics, METHODS, spread=spread)
+        evidence = EvidenceStatistics(metrics, METHODS, spread=spread)
         mce, _, *levels = verdicts(evidence, place, "PCA prior")
         assert mce.startswith(said)
         # Tests ask about the pairs alone.
@@ -329,7 +329,7 @@ def test_a_method_must_be_evaluated_everywhere_to_reach_the_goal():
         {"lambda0": 1.0, "pca": 0.8, "gp": 0.7}, datasets=("synbench",), corrupted=False
     )
     metrics = metrics[(metrics["method"] != "gp") | (metrics["backbone"] == "deftransnet")]
-    evidence = Evidence(metrics, METHODS)
+    evidence = EvidenceStatistics(metrics, METHODS)
     assert goals(evidence)["PCA prior"] == ("6 of 6", "6", "6")
     assert goals(evidence)["Gaussian process"] == ("3 of 6", "3", "3")
     # It cannot be ranked over all backbones, but it can where it was.
@@ -365,7 +365,7 @@ def test_a_method_without_a_network_is_classical_only_by_its_group():
 
 def test_large_levels_may_be_missing():
     metrics = made_up({"lambda0": 1.0, "pca": 0.8, "gp": 0.9}, datasets=("d",), corrupted=False)
-    evidence = Evidence(metrics[metrics["level"] < 0.4], METHODS)
+    evidence = EvidenceStatistics(metrics[metrics["level"] < 0.4], METHODS)
     assert tables.goal_table(evidence) is None
     assert verdicts(evidence, ("d", "deftransnet"), "PCA prior")[0].startswith("lower")
     assert figures.forest_figure(evidence, evidence.places[0]) is None
@@ -469,7 +469,7 @@ def test_a_method_seen_on_some_pairs_only_is_compared_on_these():
         {"lambda0": 1.0, "pca": 0.9, "cpd": 0.5}, datasets=("synbench",), corrupted=False
     )
     few = (metrics["method"] != "cpd") | metrics["object"].isin(["000", "001", "002"])
-    evidence = Evidence(metrics[few], METHODS)
+    evidence = EvidenceStatistics(metrics[few], METHODS)
     place = ("synbench", "robust_defreg")
     assert shown(tables.answer_table(evidence, place, "mce"))["CPD"]["Pairs"].text == "12"
     table = tables.mean_table(evidence, place, "mce")
@@ -534,7 +534,7 @@ def report(tmp_path_factory):
         written(made_up(few, datasets=("synbench",), seeds=2), folder),
         [search(folder)],
         [diagnostics],
-        [Example("synbench", folder / "pca.png", "A liver.")],
+        [ExamplePicture("synbench", folder / "pca.png", "A liver.")],
     )
     config = {"note": "<script>alert(1)</script>", "evaluation": {"training_spread": 0.05}}
     build_evidence(files, folder / "out", methods=methods, config=config)
@@ -619,7 +619,7 @@ def test_files_of_unknown_datasets_are_refused(tmp_path):
     bad.write_text("{}")
     with pytest.raises(DataError, match="lacks dataset"):
         build_evidence(Files(paths, diagnostics=[bad]), tmp_path, methods={})
-    picture = Example("moon", tmp_path / "x.png", "")
+    picture = ExamplePicture("moon", tmp_path / "x.png", "")
     with pytest.raises(DataError, match="is of moon"):
         build_evidence(Files(paths, examples=[picture]), tmp_path, methods={})
     assert not (tmp_path / "report.html").exists()
@@ -632,9 +632,9 @@ def test_backbones_of_the_evidence_alone_decide_nothing():
     some = some[some["backbone"] == "deftransnet"].assign(backbone="on_trial")
     both = pd.concat([metrics, some], ignore_index=True)
     plain, aside, counted = (
-        Evidence(metrics, METHODS),
-        Evidence(both, METHODS, aside=("on_trial",)),
-        Evidence(both, METHODS),
+        EvidenceStatistics(metrics, METHODS),
+        EvidenceStatistics(both, METHODS, aside=("on_trial",)),
+        EvidenceStatistics(both, METHODS),
     )
     assert ("synbench", "on_trial") in aside.places
     assert aside.judged == plain.places
@@ -651,7 +651,10 @@ def test_test_sets_are_shown_and_decide_nothing():
     metrics = made_up(seeds=1, corrupted=False)
     few = metrics[metrics["dataset"] == "synbench"].assign(dataset="scans", origin="path")
     both = pd.concat([metrics, few[few["level"] < 0.4]], ignore_index=True)
-    plain, aside = Evidence(metrics, METHODS), Evidence(both, METHODS, aside=("scans",))
+    plain, aside = (
+        EvidenceStatistics(metrics, METHODS),
+        EvidenceStatistics(both, METHODS, aside=("scans",)),
+    )
     assert {place for place in aside.places if place[0] == "scans"}
     assert aside.judged == plain.places
     assert aside.ranking(list(METHODS), "cd").equals(plain.ranking(list(METHODS), "cd"))
@@ -669,7 +672,7 @@ def test_targets_of_other_points_have_verdicts_of_their_own():
     means = metrics[other].groupby(["dataset", "backbone", "method"])["mce"].mean()
     best = metrics["method"] == "cpd"
     metrics.loc[other & best, "mce"] = 0.001 * means.min()
-    evidence = Evidence(metrics, METHODS)
+    evidence = EvidenceStatistics(metrics, METHODS)
     value = metrics.loc[other & best, "mce"].mean()
     place = ("deformedtissue", "robust_defreg")
     cells = shown(tables.verdict_table(evidence, place))["CPD"]

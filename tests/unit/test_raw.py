@@ -7,7 +7,7 @@ import trimesh
 
 from dine.data import raw
 from dine.data.layout import Inventory, scan
-from dine.data.raw import deform_bases, synthesise, write_dataset
+from dine.data.raw import Deformations, deform_bases, synthesise, write_dataset
 from dine.errors import ConfigError, DataError, StorageError
 from dine.files import read_json
 from dine.geometry.surface import Surface
@@ -30,8 +30,16 @@ def ball(scale: float = 1.0, **changes) -> Surface:
     return dataclasses.replace(Surface(mesh.vertices * scale, mesh.faces), **changes)
 
 
+def recipe(**changes) -> Deformations:
+    return Deformations(**(RECIPE | changes))
+
+
 def write(folder, bases, **changes) -> None:
-    write_dataset(folder, bases, **(RECIPE | {"origin": raw.SYNTHETIC} | changes))
+    origin = changes.pop("origin", raw.SYNTHETIC)
+    bases = list(bases)
+    sources = [(name, lambda surface=surface: surface) for name, surface in bases]
+    identity = [[name, surface.vertices.tolist()] for name, surface in bases]
+    write_dataset(folder, sources, recipe(**changes), origin, identity)
 
 
 def contents(folder) -> dict[str, bytes]:
@@ -101,9 +109,9 @@ def test_more_objects_levels_or_pairs_change_no_other_file(tmp_path):
 
 @pytest.mark.parametrize("kind", ["primitives", "tissue"])
 def test_synthetic_objects_keep_their_numbers(tmp_path, kind):
-    small = RECIPE | {"levels": [0.2], "pairs_per_level": 1}
-    synthesise(tmp_path / "three", kind, 3, **small)
-    synthesise(tmp_path / "late", kind, 1, first=2, **small)
+    small = recipe(levels=[0.2], pairs_per_level=1)
+    synthesise(tmp_path / "three", small, kind, 3)
+    synthesise(tmp_path / "late", small, kind, 1, first=2)
     three, late = contents(tmp_path / "three"), contents(tmp_path / "late")
     assert len(three) == 9
     assert sorted(late)[0] == "Data/002.ply"
@@ -139,11 +147,11 @@ def test_an_equal_folder_is_kept_and_a_different_one_replaced(tmp_path):
 
 
 def test_synthesis_that_is_done_makes_nothing(tmp_path, monkeypatch):
-    synthesise(tmp_path / "d", "tissue", 1, **RECIPE)
+    synthesise(tmp_path / "d", recipe(), "tissue", 1)
     monkeypatch.setattr(raw, "rbf_displacement", None)
-    synthesise(tmp_path / "d", "tissue", 1, **RECIPE)
+    synthesise(tmp_path / "d", recipe(), "tissue", 1)
     with pytest.raises(TypeError):
-        synthesise(tmp_path / "d", "tissue", 1, **(RECIPE | {"seed": 1}))
+        synthesise(tmp_path / "d", recipe(seed=1), "tissue", 1)
 
 
 @pytest.mark.parametrize("there", [False, True])
@@ -231,7 +239,7 @@ def awkward(tmp_path):
 
 
 def test_a_users_meshes_are_deformed_and_the_unusable_left_out(tmp_path, awkward, caplog):
-    deform_bases(tmp_path / "d", scan(awkward), **RECIPE)
+    deform_bases(tmp_path / "d", recipe(), scan(awkward))
     made = scan(tmp_path / "d")
     assert sorted(made.bases) == ["cloud", "open", "soup"]
     assert len(made.pairs) == 12
@@ -253,10 +261,10 @@ def test_a_users_meshes_are_deformed_and_the_unusable_left_out(tmp_path, awkward
 
 
 def test_a_changed_mesh_makes_the_dataset_anew(tmp_path, awkward):
-    deform_bases(tmp_path / "d", scan(awkward), **RECIPE)
+    deform_bases(tmp_path / "d", recipe(), scan(awkward))
     before = contents(tmp_path / "d")
     write_surface(awkward / "cloud.ply", ball(7, faces=None))
-    deform_bases(tmp_path / "d", scan(awkward), **RECIPE)
+    deform_bases(tmp_path / "d", recipe(), scan(awkward))
     after = contents(tmp_path / "d")
     changed = {name for name in before if before[name] != after[name]}
     assert changed
@@ -266,10 +274,10 @@ def test_a_changed_mesh_makes_the_dataset_anew(tmp_path, awkward):
 def test_no_usable_mesh_is_an_error_that_says_why(tmp_path):
     write_surface(tmp_path / "scans/dot.ply", Surface(np.ones((40, 3))))
     with pytest.raises(DataError, match=r"No object of .*dot: .*one position"):
-        deform_bases(tmp_path / "d", scan(tmp_path / "scans"), **RECIPE)
+        deform_bases(tmp_path / "d", recipe(), scan(tmp_path / "scans"))
     assert not (tmp_path / "d").exists()
     with pytest.raises(DataError, match="there is none"):
-        deform_bases(tmp_path / "d", Inventory(tmp_path), **RECIPE)
+        deform_bases(tmp_path / "d", recipe(), Inventory(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -312,7 +320,7 @@ def test_pairs_beyond_the_lists_are_drawn_from_the_ranges_that_they_span(tmp_pat
 
 def test_what_is_drawn_is_what_the_name_says(tmp_path):
     write(tmp_path / "d", [("a", ball())], levels=[0.1], pairs_per_level=6)
-    drawn = raw._kernels(RECIPE | {"pairs_per_level": 6}, 0, "a", "0.1")
+    drawn = recipe(pairs_per_level=6).kernels("a", "0.1")
     named = {(pair.control_percent, pair.width) for pair in scan(tmp_path / "d").pairs}
     assert named == set(drawn)
     assert sorted(drawn[:4]) == [(2, 0.3), (2, 0.5), (10, 0.3), (10, 0.5)]
@@ -328,14 +336,14 @@ def test_ranges_too_narrow_for_the_pairs_are_refused(tmp_path, widest, found):
 
 def test_bad_requests_for_synthesis(tmp_path):
     with pytest.raises(ValueError, match="primitives, tissue"):
-        synthesise(tmp_path / "d", "cubes", 3, **RECIPE)
+        synthesise(tmp_path / "d", recipe(), "cubes", 3)
     with pytest.raises(ValueError, match="objects"):
-        synthesise(tmp_path / "d", "tissue", 0, **RECIPE)
+        synthesise(tmp_path / "d", recipe(), "tissue", 0)
 
 
 def test_real_meshes(tmp_path, shared):
     inventory = scan(shared / "meshes" / "objects")
-    deform_bases(tmp_path / "d", inventory, **(RECIPE | {"levels": [0.3], "pairs_per_level": 1}))
+    deform_bases(tmp_path / "d", recipe(levels=[0.3], pairs_per_level=1), inventory)
     made = scan(tmp_path / "d")
     assert len(made.bases) == len(inventory.bases) == 23
     assert len(made.pairs) == 23

@@ -12,11 +12,11 @@ import pytest
 
 from dine.config import Dataset, Pairs
 from dine.data import dataverse
-from dine.data.dataverse import download
+from dine.data.dataverse import Fetching, download
 from dine.data.obtain import obtain
 from dine.data.pairs import read_pairs
 from dine.data.prepare import prepare_pairs
-from dine.data.raw import synthesise
+from dine.data.raw import Deformations, synthesise
 from dine.errors import DownloadError, StorageError
 from dine.files import read_json
 
@@ -120,7 +120,8 @@ def server(monkeypatch):
 
 
 def fetch(server, folder, **options):
-    return download(DOI, folder, server.address, timeout=5, **options)
+    how = {name: options.pop(name) for name in ("chunk", "retries") if name in options}
+    return download(DOI, folder, server.address, how=Fetching(timeout=5, **how), **options)
 
 
 def names(folder):
@@ -134,7 +135,11 @@ def test_files_keep_their_folders_and_the_manifest_tells_them(server, tmp_path, 
     pieces = []
     folder = tmp_path / "new/data"
     paths = download(
-        doi, folder, server.address + "/", chunk=16, progress=lambda *args: pieces.append(args)
+        doi,
+        folder,
+        server.address + "/",
+        progress=lambda *args: pieces.append(args),
+        how=Fetching(chunk=16),
     )
     expected = ["Source_1.ply", "a/Source_1.ply", "b/Source_1.ply", "a/b/Source_1.ply"]
     assert paths == [folder / name for name in expected]
@@ -535,7 +540,8 @@ def test_an_archive_larger_than_the_disk(server, tmp_path, monkeypatch):
 
 def test_a_published_dataset_goes_from_server_to_pairs(server, tmp_path):
     recipe = {"levels": [0.2], "control_percents": [5], "widths": [0.3], "amplitude": 0.15}
-    synthesise(tmp_path / "held", "tissue", 3, points=64, pairs_per_level=1, seed=0, **recipe)
+    deformations = Deformations(**recipe, points=64, pairs_per_level=1, seed=0)
+    synthesise(tmp_path / "held", deformations, "tissue", 3)
     with zipfile.ZipFile(tmp_path / "Deformation_Level.zip", "w") as archive:
         for path in sorted((tmp_path / "held" / "Deformation_Level").rglob("*.ply")):
             archive.write(path, path.relative_to(tmp_path / "held" / "Deformation_Level"))

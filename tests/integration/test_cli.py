@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from dine import cli
 from dine.io.readers import read_surface
 
-CONFIG = Path(__file__).resolve().parents[1] / "config.yaml"
+CONFIG = Path(__file__).resolve().parents[2] / "config.yaml"
 
 
 def leaves(group, path=()):

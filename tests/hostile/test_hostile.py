@@ -636,9 +636,9 @@ def test_a_search_without_a_usable_weight(tmp_path, value):
 
 
 def fetch(folder, listed, content=b"content"):
-    from dine.data.dataverse import download
+    from dine.data.dataverse import Fetching, download
 
-    return download("10.1/X", folder, session=Session(listed, content), retries=0)
+    return download("10.1/X", folder, session=Session(listed, content), how=Fetching(retries=0))
 
 
 @pytest.mark.parametrize("size", ["7", [7], -7, 7.5, True])
@@ -679,10 +679,10 @@ def test_a_file_that_does_not_end(tmp_path):
         return found
 
     session.get = get
-    from dine.data.dataverse import download
+    from dine.data.dataverse import Fetching, download
 
     with pytest.raises(DownloadError, match="arrived damaged"):
-        download("10.1/X", tmp_path, session=session, retries=0)
+        download("10.1/X", tmp_path, session=session, how=Fetching(retries=0))
 
 
 def zeros(kind):

@@ -15,7 +15,7 @@ from dine.data.pairs import (
     write_variant,
 )
 from dine.errors import DataError
-from dine.evaluation.metrics import evaluate
+from dine.evaluation.metrics import Labels, evaluate
 from dine.evaluation.predictions import Prediction, read_predictions
 from dine.evaluation.quality import correspondence
 from dine.geometry.distance import chamfer, distance_measures, distances, surface_distance
@@ -127,11 +127,11 @@ def stored(tmp_path):
 
 def run(tmp_path, predictions, variants=(), **arguments):
     write_predictions(tmp_path / "p.h5", predictions)
-    arguments = {"dataset": "d", "backbone": "b", "method": "m"} | arguments
+    method = arguments.pop("method", "m")
     evaluate(
-        *({arguments.pop("method"): tmp_path / "p.h5"}, tmp_path / "pairs.h5", list(variants)),
+        *({method: tmp_path / "p.h5"}, tmp_path / "pairs.h5", list(variants)),
         *(tmp_path / "m.csv", tmp_path / "e.h5"),
-        **arguments,
+        labels=Labels(**{"dataset": "d", "backbone": "b"} | arguments),
     )
     return pd.read_csv(tmp_path / "m.csv")
 

@@ -11,6 +11,7 @@ import trimesh
 
 import dine.data.pairs as module
 import dine.data.prepare as making
+from dine.data import splits
 from dine.data.corruption import make_variant
 from dine.data.layout import Inventory, PairFiles
 from dine.data.pairs import (
@@ -22,6 +23,7 @@ from dine.data.pairs import (
     write_variant,
 )
 from dine.data.prepare import make_pairs
+from dine.data.splits import Shares
 from dine.errors import ConfigError, DataError
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
@@ -63,7 +65,9 @@ def build(folder: Path, objects=5, levels=(0.2, 0.4), transform=lambda vertices:
 
 def make(inventory, **changes):
     settings = {"points": POINTS, "convention": "sphere", "split": FRACTIONS, "seed": 3}
-    return make_pairs(inventory, **{**settings, **changes})
+    settings |= changes
+    shares = Shares(settings.pop("split"), settings.pop("by", "object"))
+    return make_pairs(inventory, shares=shares, **settings)
 
 
 def swap(inventory, position, **changes):
@@ -326,7 +330,7 @@ def test_split_is_shuffled_by_seed_and_independent_of_the_number_of_pairs(invent
 
 
 def test_fractions_are_followed():
-    share = making._split_objects
+    share = splits._split_objects
     parts = list(
         share(set(map(str, range(100))), {"train": 0.7, "val": 0.1, "test": 0.2}, 0).values()
     )
@@ -448,9 +452,9 @@ def test_one_deformation_at_several_levels_stays_together(inventory):
 def test_levels_are_shared_by_hand():
     share = {"train": 0.5, "test": 0.5}
     # Both parts lack one pair of either level; the object's balance decides, then the level's.
-    assert making._share_levels([[1], [2], [1], [2]], share) == ["train", "test", "test", "train"]
+    assert splits._share_levels([[1], [2], [1], [2]], share) == ["train", "test", "test", "train"]
     # What is left must go where nothing is yet.
-    assert making._share_levels([[1], [2]], {"train": 0.9, "test": 0.1}) == ["train", "test"]
+    assert splits._share_levels([[1], [2]], {"train": 0.9, "test": 0.1}) == ["train", "test"]
 
 
 def test_too_few_deformations_for_the_splits(inventory):

@@ -158,9 +158,12 @@ def test_the_digest_follows_the_code_of_the_package(tmp_path, monkeypatch, fresh
     assert changed_by("files.py", longer) == steps
     assert changed_by("files.py", reworded) == []
     # Of the command line, each step has its own command, without the help.
-    assert changed_by("cli.py", lambda text: text.replace("Aggregate metrics", "Sum up")) == []
+    assert (
+        changed_by("cli/reporting.py", lambda text: text.replace("Aggregate metrics", "Sum up"))
+        == []
+    )
     assert changed_by(
-        "cli.py",
+        "cli/reporting.py",
         lambda text: text.replace("made = all_tables(", "made = list(all_tables(").replace(
             "load_metrics(metrics), spread)", "load_metrics(metrics), spread))"
         ),

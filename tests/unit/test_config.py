@@ -25,7 +25,7 @@ from dine.results import (
     table_names,
 )
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FILES = (ROOT / "config" / "evidence.yaml", ROOT / "config.yaml")  # as the Snakefile reads them
 DEFAULT = functools.reduce(config.merge, map(config.read_yaml, FILES))
 

@@ -25,7 +25,7 @@ from dine.priors import load_prior
 from dine.training.data_terms import DATA_TERMS
 
 pytestmark = pytest.mark.numerical
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples" / "extending"
 CONFIGS = (ROOT / "config.yaml", EXAMPLES / "config.yaml")
 BACKBONE = "my_package.backbones:AffineNet"

@@ -49,7 +49,7 @@ def toy_pairs(count=5, points=40, seed=0):
 
 def job(folder, objective=None, settings=SETTINGS, seed=0, identity=IDENTITY):
     objective = objective or Objective(DATA_TERMS.get("chamfer")())
-    return loop.Job(objective, settings, seed, folder, identity, "toy")
+    return loop.TrainingJob(objective, settings, seed, folder, identity, "toy")
 
 
 def run(folder, *, steps=6, identity=IDENTITY, on_step=None, objective=None, settings=SETTINGS):

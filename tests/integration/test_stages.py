@@ -117,16 +117,17 @@ def test_what_chance_can_hide_is_left_to_the_stronger_prior(tolerance, expected)
 def test_a_search_goes_on_until_the_best_lies_inside(
     tmp_path, monkeypatch, best, extend, tried, selected
 ):
-    def stage2(*_, weight, out, **__):
+    def stage2(pairs, model, settings, order, *, weight, **_):
         # How far λ is from the best, in steps; the control is beyond all.
         error = abs(np.log10(weight / best)) if weight else 99.0
-        out.mkdir(parents=True)
-        write_json(out / "run.json", {"final": dict.fromkeys(VALIDATION_COLUMNS, error)})
+        order.out.mkdir(parents=True)
+        write_json(order.out / "run.json", {"final": dict.fromkeys(VALIDATION_COLUMNS, error)})
 
     monkeypatch.setattr("dine.training.stage2.stage2", stage2)
     search = LambdaSearch(candidates=[1e-2, 1e-3], extend=extend)
     out = tmp_path / "lambda.json"
-    search_lambda(out, out, {"pca": out}, Stage2(), search, seed=0, out=out)
+    order = stages.Order(seed=0, out=out, name="search")
+    search_lambda(out, out, {"pca": out}, Stage2(), search, order)
     result = read_json(out)
     assert [row["lambda"] for row in result["curve"]] == [0, *tried]
     assert result["selected"] == {"pca": selected}

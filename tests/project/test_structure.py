@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dine"
 RULES = sorted((ROOT / "workflow" / "rules").glob("*.smk"))
 
@@ -61,6 +61,60 @@ def modules():
 def test_nothing_imports_upwards(name, path):
     own = floor_of(name)
     assert not {other for other in imported(path) if floor_of(other) > own}
+
+
+LONGEST, MOST_PARAMETERS = 60, 7
+EXCEPTIONS = {
+    "dine.registration.register.register": "public, all but two of its arguments by keyword",
+}
+
+
+def functions(node, name):
+    """All functions below a syntax tree's node, by their full names."""
+    for inner in ast.iter_child_nodes(node):
+        if isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            if not isinstance(inner, ast.ClassDef):
+                yield f"{name}.{inner.name}", inner
+            yield from functions(inner, f"{name}.{inner.name}")
+        else:
+            yield from functions(inner, name)
+
+
+def parameters(function):
+    """How many parameters a function takes, apart from ``self`` and its like."""
+    given = function.args
+    names = [p.arg for p in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    names += [p.arg for p in (given.vararg, given.kwarg) if p is not None]
+    return len([name for name in names if name not in ("self", "cls", "ctx")])
+
+
+def is_kernel(function):
+    return any("jit" in ast.unparse(decorator) for decorator in function.decorator_list)
+
+
+@pytest.mark.parametrize(("name", "path"), modules())
+def test_functions_are_short_and_take_few_parameters(name, path):
+    found = dict(functions(ast.parse(path.read_text()), name))
+    assert not {
+        (other, function.end_lineno - function.lineno + 1, parameters(function))
+        for other, function in found.items()
+        if other not in EXCEPTIONS
+        and not is_kernel(function)
+        and (
+            function.end_lineno - function.lineno >= LONGEST
+            or parameters(function) > MOST_PARAMETERS
+        )
+    }
+
+
+def test_exceptions_are_still_needed():
+    """An exception that no function needs any more goes."""
+    needed = set()
+    for name, path in (parameter.values for parameter in modules()):
+        for other, function in functions(ast.parse(path.read_text()), name):
+            if parameters(function) > MOST_PARAMETERS and not is_kernel(function):
+                needed.add(other)
+    assert needed == set(EXCEPTIONS)
 
 
 def test_contributing_lists_the_packages_from_the_ground_up():

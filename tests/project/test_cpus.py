@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-PATH = Path(__file__).parents[1] / ".ci" / "cpus.py"
+PATH = Path(__file__).parents[2] / ".ci" / "cpus.py"
 SHOW = [sys.executable, "-c", "import json, os; print(json.dumps(dict(os.environ)))"]
 
 

@@ -1,0 +1,138 @@
+"""Options that commands share, and how their values reach them."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from dine import config
+from dine.errors import ConfigError
+
+IN = click.Path(exists=False, dir_okay=False, path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
+OUT = click.Path(path_type=Path)
+
+
+class SectionType(click.ParamType):
+    """A settings section: JSON text, or ``@file`` for a YAML or JSON file; checked on reading."""
+
+    name = "JSON|@FILE"
+
+    def __init__(self, model: type[config.Section]):
+        self.model = model
+
+    def convert(self, value, param, ctx):
+        if isinstance(value, config.Section):
+            return value
+        if value.startswith("@"):
+            return config.validate_section(self.model, config.read_yaml(value[1:]), value[1:])
+        try:
+            values = json.loads(value)
+        except ValueError as error:
+            raise ConfigError(f"--settings is neither JSON nor @FILE: {error}.") from None
+        return config.validate_section(self.model, values, "--settings")
+
+
+def json_or_file(context, parameter, value):
+    """JSON text, or a JSON or YAML file, with or without @ before its name."""
+    if value is None or not value.lstrip().startswith("{"):
+        return None if value is None else config.read_yaml(value.removeprefix("@"))
+    try:
+        return json.loads(value)
+    except ValueError as error:
+        raise ConfigError(f"{parameter.opts[0]} is neither JSON nor a file: {error}.") from None
+
+
+def settings_option(model: type[config.Section]):
+    return click.option(
+        "--settings",
+        type=SectionType(model),
+        default="{}",
+        show_default=True,
+        help=f"{model.__name__} settings; keys as in config.yaml, defaults where left out.",
+    )
+
+
+def out_option(help: str, type: click.ParamType = OUT):
+    return click.option("--out", type=type, required=True, help=help)
+
+
+seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+name_option = click.option("--name", default="", help="Shown with the progress.")
+batch_option = click.option(
+    "--batch-size",
+    type=click.IntRange(1),
+    default=config.Evaluation().batch_size,
+    show_default=True,
+    help="Pairs at a time.",
+)
+variants_option = click.option(
+    "--variant", "variants", type=IN, multiple=True, help="Corrupted targets; repeatable."
+)
+pairs_option = click.option("--pairs", type=IN, required=True, help="Pairs (HDF5).")
+several_pairs_option = click.option(
+    "--pairs", type=IN, multiple=True, required=True, help="Pairs (HDF5); repeatable."
+)
+targets_option = click.option(
+    "--targets", type=IN, multiple=True, help="Of `resample`, one for each file of pairs."
+)
+model_option = click.option("--model", type=IN, required=True, help="Weights (safetensors).")
+
+
+def gathered(into: str, make: Callable[..., Any], *options: Callable) -> Callable:
+    """Options whose values a command gets as one argument, ``into``: ``make(**values)``."""
+
+    def decorate(command):
+        @functools.wraps(command)
+        def run(**values):
+            own = {name: values.pop(name) for name in names}
+            return command(**values, **{into: make(**own)})
+
+        run.__click_params__ = []
+        for option in reversed(options):
+            option(run)
+        names = [parameter.name for parameter in run.__click_params__]
+        run.__click_params__ = [*getattr(command, "__click_params__", []), *run.__click_params__]
+        return run
+
+    return decorate
+
+
+def compute_flags(*names: str) -> list[Callable]:
+    """Options for some of the keys of ``Compute``."""
+    kinds = {
+        "device": click.Choice(["auto", "cpu", "cuda"]),
+        "precision": click.Choice(["float32", "bf16"]),
+        "processes": click.IntRange(1),
+    }
+    fields = config.Compute.model_fields
+    return [
+        click.option(
+            f"--{name}",
+            type=kinds[name],
+            default=fields[name].default,
+            show_default=True,
+            help=fields[name].description,
+        )
+        for name in names
+    ]
+
+
+def compute_options(*names: str) -> Callable:
+    """The same, given to the command as ``compute``."""
+    return gathered("compute", config.Compute, *compute_flags(*names))
+
+
+def start_torch() -> None:
+    """Import torch, with the number of threads that was asked for."""
+    import torch
+
+    threads = os.environ.get("OMP_NUM_THREADS")
+    if threads:
+        torch.set_num_threads(int(threads))
