@@ -906,6 +906,7 @@ def register(
     a report (OUT.json) and, with --view, a page to look at (OUT.html).
     """
     from dine.io.readers import read_surface
+    from dine.io.writers import check_holds
     from dine.registration.output import Outputs, save
     from dine.registration.register import register as run
     from dine.registration.shapes import shapes_by_name
@@ -914,9 +915,11 @@ def register(
     shapes = shapes_by_name(apply)
     outputs = Outputs(out)
     outputs.check(shapes, view=view, overwrite=overwrite)
+    moving = read_surface(source)
+    check_holds(out, moving)
     marks = [read_surface(path).vertices for path in landmarks] if landmarks else None
     result = run(
-        source,
+        moving,
         target,
         model=load_model(),
         prealign=_alignment(prealign),
@@ -929,7 +932,7 @@ def register(
         seed=seed,
         device=device,
     )
-    said = save(result, outputs, colors_from=source, applied=shapes, view=view, overwrite=overwrite)
+    said = save(result, outputs, applied=shapes, view=view, overwrite=overwrite)
     report = result.report
     click.echo(
         f"{out}: HD95 {report['before']['hd95']:.4g} -> {report['after']['hd95']:.4g}, "

@@ -148,7 +148,7 @@ def _report(
     model: Model,
 ) -> dict[str, Any]:
     """What the JSON report says, but for settings, landmarks and time."""
-    lengths = np.linalg.norm(displacement, axis=1)
+    lengths = np.linalg.norm(displacement, axis=1)[pair.source.used]
     alignment = pair.alignment
     return {
         "dine": __version__,

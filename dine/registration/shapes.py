@@ -13,6 +13,7 @@ from dine.errors import ConfigError, DataError
 from dine.geometry.oriented import evenly
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
+from dine.io.text import format_stem
 
 Shape = str | Path | Surface | np.ndarray | tuple[np.ndarray, np.ndarray]
 """A file, a surface, (V, 3) points, or vertices and faces."""
@@ -54,7 +55,7 @@ def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:
     Raises:
         ConfigError: two of the same stem.
     """
-    named = {path.stem: path for path in paths}
+    named = {format_stem(path): path for path in paths}
     if len(named) < len(paths):
         raise ConfigError("Two of the shapes to move along have the same name; rename one.")
     return named
@@ -99,10 +100,11 @@ def check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
 
 
 def _size(surface: Surface, what: str) -> float:
-    middle = np.median(surface.vertices, axis=0)
-    distance = np.linalg.norm(surface.vertices - middle, axis=1)
+    places = surface.vertices[surface.used]
+    middle = np.median(places, axis=0)
+    distance = np.linalg.norm(places - middle, axis=1)
     size = float(np.median(distance) or distance.mean())
-    if len(surface.vertices) == 1 or size <= 1e-12 * np.abs(middle).max():
+    if len(places) == 1 or size <= 1e-12 * np.abs(middle).max():
         raise DataError(
             f"All points of {surface.name}, the {what}, coincide; expected the surface of an "
             "object."
@@ -119,7 +121,8 @@ def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) ->
     """
     if points < FEWEST:
         raise ConfigError(f"The number of points is {points}; expected at least {FEWEST}.")
-    extent = surface.vertices - surface.vertices.mean(axis=0)
+    extent = surface.vertices[surface.used]
+    extent = extent - extent.mean(axis=0)
     widths = np.linalg.svd(extent, compute_uv=False)
     if widths[1] <= 1e-6 * widths[0]:
         raise DataError(

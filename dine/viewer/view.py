@@ -120,7 +120,9 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         _scalar(name, values, len(result), rows, view.units.get(name, ""))
         for name, values in view.scalars.items()
     ]
-    every = np.concatenate([source.vertices, target.vertices, result])
+    # Vertices that no face uses are not drawn, wherever they lie.
+    shown_target = target.vertices[target.used]
+    every = np.concatenate([source.vertices[source.used], shown_target, result[source.used]])
     centre = (every.min(axis=0) + every.max(axis=0)) / 2
     radius = float(np.linalg.norm(every - centre, axis=1).max()) or 1.0
 
@@ -137,7 +139,7 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         "scalars": shown,
         "layers": layers,
         "colormap": _colors(),
-        "view": _viewpoint(target.vertices),
+        "view": _viewpoint(shown_target),
     }
 
 
