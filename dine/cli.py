@@ -13,13 +13,25 @@ import click
 
 from dine import __version__, config
 from dine.errors import ConfigError, DataError, DineError
-from dine.files import storage_errors, write_json, write_text
+from dine.files import check_place, storage_errors, write_json, write_text
 
 # Heavy modules (torch, matplotlib) are imported by the command that needs them.
 
 IN = click.Path(exists=False, dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
-OUT = click.Path(path_type=Path)
+
+
+class _Output(click.Path):
+    """A path to write to: refused before anything is computed if that cannot be done."""
+
+    def convert(self, value, param, ctx):
+        path = super().convert(value, param, ctx)
+        check_place(path)
+        return path
+
+
+OUT = _Output(path_type=Path)
+OUT_FOLDER = _Output(file_okay=False, path_type=Path)
 
 log = logging.getLogger("dine")
 
@@ -133,7 +145,8 @@ def cli(log_file: Path | None, threads: int | None):
     if log_file is not None:
         with storage_errors(log_file.parent):
             log_file.parent.mkdir(parents=True, exist_ok=True)
-            handlers.append(logging.FileHandler(log_file, encoding="utf-8"))
+            kept = {"encoding": "utf-8", "errors": "backslashreplace"}
+            handlers.append(logging.FileHandler(log_file, **kept))
         logging.raiseExceptions = False  # a log that fills the disk is not what to read about
     logging.basicConfig(
         level=logging.INFO,
@@ -237,7 +250,7 @@ def inspect(folder: Path):
 @settings_option(config.Dataset)
 @click.option("--first-object", type=click.IntRange(0), default=0, help="First synthetic number.")
 @seed_option
-@click.option("--out", type=FOLDER, required=True, help="The dataset's results folder.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="The dataset's results folder.")
 def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
     """Make, find or download raw meshes.
 
@@ -343,7 +356,7 @@ backbone_option = click.option(
 @seed_option
 @training_options
 @name_option
-@click.option("--out", type=FOLDER, required=True, help="Run folder.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Run folder.")
 def stage1(pairs, backbone, settings, seed, compute, name, out):
     """Train a backbone on the Chamfer distance alone.
 
@@ -371,7 +384,7 @@ def stage1(pairs, backbone, settings, seed, compute, name, out):
 @settings_option(config.Pretraining)
 @seed_option
 @training_options
-@click.option("--out", type=FOLDER, required=True, help="Run folder.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Run folder.")
 def pretrain(pairs, targets, backbone, settings, seed, compute, out):
     """Train weights to start Stage 1 from, on synthetic pairs with known displacement.
 
@@ -478,7 +491,7 @@ def search_lambda(pairs, model, priors, stage2_settings, settings, seed, compute
 @seed_option
 @training_options
 @name_option
-@click.option("--out", type=FOLDER, required=True, help="Run folder.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Run folder.")
 def stage2(pairs, model, variant, prior, weight, settings, seed, compute, name, out):
     """Refine a Stage-1 model with λ times a frozen prior; without a prior, the λ = 0 control.
 
@@ -660,7 +673,7 @@ def diagnose(prior, fields, pairs, dataset, backbone, name, seed, out):
     default=config.Evaluation().training_spread,
     help="How much differences vary with the training (`evaluation.training_spread`).",
 )
-@click.option("--out", type=FOLDER, required=True, help="Folder for CSV, Markdown and LaTeX.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Folder for CSV, Markdown and LaTeX.")
 def tables(metrics, spread, out):
     """Aggregate metrics into the paper's tables and their companions.
 
@@ -677,7 +690,7 @@ def tables(metrics, spread, out):
 @cli.command()
 @click.option("--results", type=FOLDER, required=True, help="The workflow's results folder.")
 @settings_option(config.Config)
-@click.option("--out", type=FOLDER, required=True, help="Folder for PNG and PDF.")
+@click.option("--out", type=OUT_FOLDER, required=True, help="Folder for PNG and PDF.")
 def figures(results, settings, out):
     """Draw all figures of a finished run.
 
@@ -752,7 +765,9 @@ def examples(pairs, variants, names, predictions, methods, dataset, out):
 @click.option(
     "--settings", callback=_json_or_file, metavar="JSON|FILE", help="Configuration to show."
 )
-@click.option("--out", type=FOLDER, required=True, help="Folder for report, tables and figures.")
+@click.option(
+    "--out", type=OUT_FOLDER, required=True, help="Folder for report, tables and figures."
+)
 def evidence(metrics, methods, reference, searches, diagnostics, examples, settings, out):
     """Write the report on whether a prior helps: tests, tables, figures and findings.
 
@@ -917,14 +932,13 @@ def register(
     outputs.check(shapes, view=view, overwrite=overwrite)
     moving = read_surface(source)
     check_holds(out, moving)
-    marks = [read_surface(path).vertices for path in landmarks] if landmarks else None
     result = run(
         moving,
         target,
         model=load_model(),
         prealign=_alignment(prealign),
         apply=shapes,
-        landmarks=tuple(marks) if marks else None,
+        landmarks=landmarks or None,
         rounds=rounds,
         surfaces=surfaces,
         partial=partial,
@@ -959,7 +973,7 @@ def register(
     """,
 )
 @click.argument("manifest", type=click.Path(exists=False, path_type=Path))
-@click.option("-o", "--out", type=FOLDER, required=True, help="Folder of all results.")
+@click.option("-o", "--out", type=OUT_FOLDER, required=True, help="Folder of all results.")
 @click.option("--suffix", default="", help="Format of the moved sources, such as .ply.")
 @registration_options
 @model_options
@@ -1044,6 +1058,7 @@ def calibrate(model, pairs, targets, raws, prior, device, out):
 
 def main() -> None:
     """Entry point: user errors become one line on standard error."""
+    sys.stdout.reconfigure(errors="backslashreplace")  # file names may be no text
     try:
         cli(standalone_mode=False)
     except click.exceptions.Abort:

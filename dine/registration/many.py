@@ -106,7 +106,8 @@ def register_many(
             progress.update()
     summary = pd.DataFrame(rows)
     with atomic_path(out / "summary.csv") as temporary:
-        summary.to_csv(temporary, index=False, float_format="%.6g")
+        form = {"float_format": "%.6g", "errors": "backslashreplace"}
+        summary.to_csv(temporary, index=False, **form)
     return summary
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from dine.errors import ConfigError, DataError
 from dine.geometry.oriented import evenly
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
+from dine.io.slicer import in_space
 from dine.io.text import format_stem
 
 Shape = str | Path | Surface | np.ndarray | tuple[np.ndarray, np.ndarray]
@@ -61,19 +62,49 @@ def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:
     return named
 
 
-def checked_landmarks(landmarks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+Points = np.ndarray | str | Path
+"""(L, 3) points, or a file of them."""
+
+
+def checked_landmarks(
+    landmarks: tuple[Points, Points], source: Surface, target: Surface
+) -> tuple[np.ndarray, np.ndarray]:
     """Corresponding (L, 3) points of source and target, as float64.
 
+    Points of a file that states its space (LPS or RAS) are brought into that of the scan. 3D Slicer
+    takes scans that state none to be in LPS, and so it is here.
+
     Raises:
-        DataError: other shapes, or of different numbers.
+        DataError: unreadable, other shapes, or of different numbers.
     """
-    here, there = (np.asarray(x, dtype=np.float64) for x in landmarks)
+    scans = (source, target)
+    here, there = (_in_space_of(x, scan) for x, scan in zip(landmarks, scans, strict=True))
     if here.shape != there.shape or here.ndim != 2 or here.shape[1] != 3:
         raise DataError(
             f"The landmarks have shapes {here.shape} and {there.shape}; expected as many rows "
             "of three coordinates on the source as on the target, in the same order."
         )
     return here, there
+
+
+def _in_space_of(points: Points, scan: Surface) -> np.ndarray:
+    if isinstance(points, str | Path):
+        return in_space(read_surface(points), scan.space or "LPS")
+    return np.asarray(points, dtype=np.float64)
+
+
+def check_spaces(source: Surface, others: Iterable[Surface]) -> None:
+    """Refuse scans that are stated to be in different patient coordinates.
+
+    Raises:
+        DataError: one is in LPS and one in RAS.
+    """
+    for other in others:
+        if None not in (source.space, other.space) and source.space != other.space:
+            raise DataError(
+                f"{source.name} is in {source.space} and {other.name} in {other.space}; export "
+                "both in the same coordinates."
+            )
 
 
 def check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
