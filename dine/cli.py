@@ -871,7 +871,7 @@ def _alignment(prealign: str):
     from dine.geometry.rigid import check_rigid
 
     try:
-        return check_rigid(np.loadtxt(prealign), prealign)
+        return check_rigid(np.loadtxt(prealign, encoding="utf-8-sig"), prealign)
     except (OSError, ValueError) as error:
         raise DataError(
             f"--prealign {prealign} is neither auto nor off nor a readable text file of a 4×4 "

@@ -173,6 +173,15 @@ def test_text_stl_of_several_solids(tmp_path):
         read(tmp_path / "a.stl", solids("a").replace("  vertex", "color", 1))
 
 
+@pytest.mark.parametrize("name", ["faces", "triangles", "cells", "tri"])
+def test_faces_of_arrays_go_by_several_names(tmp_path, name):
+    np.savez(tmp_path / "a.npz", points=V, **{name: F}, label=np.arange(len(V)), other=np.ones(3))
+    surface = read_surface(tmp_path / "a.npz")
+    assert_ball(surface)
+    np.testing.assert_array_equal(surface.data["label"], np.arange(len(V)))
+    assert surface.left_out == ("other",)
+
+
 # --- harmless extras --------------------------------------------------------------------------
 
 
@@ -207,6 +216,21 @@ def test_a_binary_stl_of_more_triangles_than_announced_is_refused(tmp_path):
         read(tmp_path / "a.stl", binary_stl() + binary_stl())
 
 
+@pytest.mark.parametrize("name", ["text.ply", "binary.ply", "a.off", "a.pcd"])
+def test_more_rows_than_announced_are_refused(tmp_path, name):
+    path = tmp_path / name
+    if path.suffix == ".pcd":
+        path.write_text(pcd("ascii") + ROWS)
+        more = b"0 0 0\n"
+    else:
+        write_moved(path, Surface(V, F), text=name == "text.ply")
+        more = b"3 0 1 2\n" if name != "binary.ply" else struct.pack("<B3i", 3, 0, 1, 2)
+    whole = path.read_bytes()
+    np.testing.assert_array_equal(read(path, whole + b"\nwritten by someone\n").vertices, V)
+    with pytest.raises(DataError, match=r"more .*than its header announces"):
+        read(path, whole + more)
+
+
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_line_ends_of_all_systems(tmp_path, end):
     write_moved(tmp_path / "a.ply", Surface(V, F), text=True)
@@ -237,6 +261,8 @@ MORE = np.hstack([V, np.arange(len(V))[:, None], np.full((len(V), 3), 7.0)])
         (table(V, ";"), ()),
         (table(V, "; ").replace(".", ","), ()),
         (table(V, ", ").replace("\n", ",\n"), ()),
+        (table(V, "\t").replace(".", ","), ()),
+        (table(V).replace(".", ","), ()),
         (f"{len(V)}\n{table(MORE)}", ("columns 4 to 7",)),
         (f"X Y Z\n{ROWS}", ()),
         (f'"Points:0","Points:1","Points:2"\n{table(V, ",")}', ()),
@@ -263,7 +289,7 @@ def test_tables_with_more_than_three_columns(tmp_path, suffix, text, left_out):
         (f"0 1 2\nx y z\n{ROWS}", "not a table"),
         (f"{ROWS}1 2\n", "number of columns changed from 3 to 2"),
         (f"{ROWS}x y z\n", "not a table of numbers"),
-        ("1,5 2,5 3,5\n", "not a table"),
+        ("1,5 2,5 3,5,\n", "not a table"),
     ],
 )
 def test_tables_that_say_something_else(tmp_path, text, said):

@@ -414,7 +414,7 @@ def test_empty_files_and_garbage(tmp_path, suffix, content, message):
         ("a.csv", b"a,b,c\n1,2,3\n", "names its columns a, b, c; expected .* x, y and z"),
         ("a.csv", b"x,y,z\n", "holds no rows"),
         ("a.csv", b"1,,3\n", "not a table"),
-        ("a.csv", b"1,5 2,5 3,5\n", "not a table"),
+        ("a.csv", b"1,5 2,5 3;5\n", "2 columns"),
         ("a.csv", b"1,2,nan\n", "NaN or infinite"),
         ("a.npy", npy(VERTICES)[:-9], "damaged, cut short"),
         ("a.npy", npy(VERTICES[:, :2]), r"shape \(6, 2\); expected numbers"),

@@ -16,6 +16,8 @@ from dine.io.meshes import nothing_in
 # Without names for its columns a wider table is something else than points.
 _MOST_COLUMNS = 12
 _COMMENT = re.compile(r"^\s*(?:#|//)")
+# At least one comma within a number, and none between them.
+_DECIMAL_COMMAS = re.compile(r"(?=.*,)[-+\d.e]+(?:,[\de+-]+)?(?:\s+[-+\d.e]+(?:,[\de+-]+)?){2,}")
 # "x", "X [mm]", "Points:0", "pos_y": an axis, perhaps after a word for points and before a unit.
 _AXIS = re.compile(
     r"(?P<word>points?|pos|position|coords?|coordinates?)?[\s_:.]*(?P<axis>[xyz]|(?<=[\s_:.])[012])"
@@ -66,8 +68,9 @@ def _lines(path: Path, content: str) -> tuple[list[list[str]], list[str] | None]
             above = line
     if not rows:
         raise DataError(f"{path} holds no rows; expected columns of x, y and z.")
-    last = rows[-1]
-    delimiter = ";" if ";" in last else "," if "," in last else None
+    if ";" in rows[-1] or _DECIMAL_COMMAS.fullmatch(rows[-1]):
+        rows = [row.replace(",", ".") for row in rows]
+    delimiter = next((mark for mark in ";," if mark in rows[-1]), None)
     fields = [_fields(row, delimiter) for row in rows]
     if len(fields[0]) == 1 and fields[0][0].isdigit() and len(fields) > 1:
         count, fields = int(fields[0][0]), fields[1:]
@@ -95,8 +98,6 @@ def _lines(path: Path, content: str) -> tuple[list[list[str]], list[str] | None]
 
 
 def _fields(row: str, delimiter: str | None) -> list[str]:
-    if delimiter == ";":  # where a comma is the decimal sign
-        row = row.replace(",", ".")
     fields = [field.strip().strip("\"'") for field in row.split(delimiter)]
     return fields[:-1] if len(fields) > 1 and not fields[-1] else fields
 
@@ -231,6 +232,7 @@ def _pcd_text(
     lines = [line.split() for line in text.rows(body)]
     if len(lines) < count:
         raise ValueError(f"{len(lines)} points where {count} are announced")
+    text.refuse_more(map(b" ".join, lines[count:]), "points")
     rows = np.array(lines[:count], dtype=np.float64)
     table, start = {}, 0
     for name, kind, shape in columns:

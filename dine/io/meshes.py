@@ -162,13 +162,14 @@ def read_off(path: Path, data: bytes) -> Surface:
         corners += row[1 : 1 + size]
         ends.append(len(corners))
         colored |= len(row) > 1 + size
+    text.refuse_more(map(b" ".join, rows[vertices + faces :]), "faces")
     left_out += ["colors of faces"] * colored
     if polygons.small(np.array(ends, dtype=np.int64)):
         left_out.append("edges")
     triangles = polygons.fans(np.array(ends, dtype=np.int64))
     cells = np.array([int(corner) for corner in corners], dtype=np.int64)
     found = cells[triangles] if len(triangles) else None
-    return Surface(table[:, :3], found, str(path), values, None, None, tuple(left_out))
+    return Surface(table[:, :3], found, str(path), values, left_out=tuple(left_out))
 
 
 # --- STL --------------------------------------------------------------------------------------

@@ -62,6 +62,7 @@ def read_ply(path: Path, data: bytes) -> Surface:
             tables[element.name] = _text_rows(element, rows)
         else:
             tables[element.name], start = _binary_rows(element, body, start, _ORDERS[kind])
+    _check_end(list(rows) if rows is not None else body[start:])
     vertex = tables.pop("vertex", {})
     if not {"x", "y", "z"} <= vertex.keys() or len(vertex["x"]) == 0:
         raise DataError(
@@ -73,6 +74,14 @@ def read_ply(path: Path, data: bytes) -> Surface:
     faces, texture, others = _faces(path, tables)
     space = text.stated_space(data)
     return Surface(vertices, faces, str(path), values, texture, space, (*left_out, *others))
+
+
+def _check_end(rest: list[bytes] | bytes) -> None:
+    """Refuse further rows behind those that the header announces; blanks and text are harmless."""
+    if isinstance(rest, list):
+        text.refuse_more(rest, "the last element")
+    elif b"\0" in (rest := rest.strip(b"\0 \t\r\n\x1a")) or not rest.isascii():
+        raise ValueError("it holds more than its header announces")
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], bytes]:

@@ -147,7 +147,7 @@ def _read_mat(path: Path, data: bytes) -> Surface:
         clouds = [
             name
             for name, value in arrays.items()
-            if name != "faces" and value.ndim == 2 and value.shape[1] in (3, 6)
+            if name not in _FACES and value.ndim == 2 and value.shape[1] in (3, 6)
         ]
         if len(clouds) == 1:
             arrays["vertices"] = arrays.pop(clouds[0])
@@ -171,6 +171,9 @@ def _datasets(file: h5py.File) -> list[str]:
     ]
 
 
+_FACES = ("faces", "triangles", "cells", "tri")
+
+
 def _named(
     path: Path,
     names: Iterable[str],
@@ -187,11 +190,12 @@ def _named(
             f"{', '.join(names) or 'none'}); rename the one with the coordinates."
         )
     arrays, left_out = {"vertices": read(own)}, []
-    if "faces" in names:
-        arrays["faces"] = read("faces")
+    cells = next((name for name in _FACES if name in names), None)
+    if cells is not None:
+        arrays["faces"] = read(cells)
     count = len(arrays["vertices"]) if np.ndim(arrays["vertices"]) else 0
     for name in names:
-        if name in (own, "faces"):
+        if name in (own, cells):
             continue
         try:
             values = np.asarray(read(name))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 _SPACE = re.compile(rb"SPACE\s*=\s*(LPS|RAS)\b", re.IGNORECASE)
@@ -44,3 +45,13 @@ def stated_space(data: bytes) -> str | None:
     """``LPS`` or ``RAS``, as 3D Slicer states it near the beginning of meshes that it writes."""
     found = _SPACE.search(data[:1000])
     return found[1].decode().upper() if found else None
+
+
+def refuse_more(rows: Iterable[bytes], what: str) -> None:
+    """Refuse further rows of numbers behind those that a header announces; other text is harmless.
+
+    Raises:
+        ValueError: there are such rows.
+    """
+    if any(re.match(rb"[-+.\d]+(?:\s+[-+.\d]|$)", row) for row in rows):
+        raise ValueError(f"it holds more rows of {what} than its header announces")

@@ -64,7 +64,10 @@ class Outputs:
         for path in others:
             check_output(path, [path.suffix], overwrite=overwrite)
         for name, path in applied.items():
-            check_output(self.applied(name, path), SURFACE_SUFFIXES, overwrite=overwrite)
+            further = self.applied(name, path)
+            if further in others:
+                raise DataError(f"{path} would become {further}, another output; rename it.")
+            check_output(further, SURFACE_SUFFIXES, overwrite=overwrite)
 
 
 def save(

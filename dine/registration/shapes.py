@@ -84,6 +84,8 @@ def checked_landmarks(
             f"The landmarks have shapes {here.shape} and {there.shape}; expected as many rows "
             "of three coordinates on the source as on the target, in the same order."
         )
+    if not (np.isfinite(here).all() and np.isfinite(there).all()):
+        raise DataError("The landmarks hold NaN or infinite coordinates; leave these points out.")
     return here, there
 
 
