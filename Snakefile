@@ -6,7 +6,10 @@ min_version("9.19")
 
 
 configfile: Path(workflow.basedir) / "config" / "evidence.yaml"
-configfile: "config.yaml"
+configfile:
+    "config.yaml"
+    if Path("config.yaml").exists()
+    else Path(workflow.basedir) / "config.yaml"
 
 
 report: "workflow/report/workflow.rst"

@@ -28,6 +28,9 @@ _STORAGE_ERRNOS = {
     errno.EROFS: "the file system is read-only",
     errno.EACCES: "the folder is not writable",
     errno.EPERM: "the folder is not writable",
+    errno.ENOTDIR: "a part of the path is a file, not a folder",
+    errno.EEXIST: "a part of the path is a file, not a folder",
+    errno.ENAMETOOLONG: "the name is too long",
 }
 
 
@@ -52,13 +55,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _tidy(path.parent.resolve(), os.getpid())
-        handle, name = tempfile.mkstemp(
-            prefix=f".{path.stem}.{os.getpid()}{_HERE}",
-            suffix=f".part{path.suffix}",
-            dir=path.parent,
-        )
-        os.close(handle)
-        temporary = Path(name)
+        temporary = _temporary(path, path.parent)
         yield temporary
         umask = os.umask(0)
         os.umask(umask)
@@ -75,6 +72,31 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def _temporary(path: Path, folder: Path) -> Path:
+    """A new empty file in a folder, named after ``path`` and this process."""
+    prefix, suffix = f".{path.stem}.{os.getpid()}{_HERE}", f".part{path.suffix}"
+    handle, name = tempfile.mkstemp(suffix, prefix, folder)
+    os.close(handle)
+    return Path(name)
+
+
+def check_place(path: str | os.PathLike) -> None:
+    """Refuse a path at which nothing could be written; nothing is left there.
+
+    Raises:
+        StorageError: a part of the path is a file, the folder cannot be written, or the disk is
+            full.
+    """
+    path = Path(path)
+    with storage_errors(path):
+        folder = path.parent
+        with contextlib.suppress(FileNotFoundError):
+            os.stat(path)  # whatever is there, its name can be
+        while not folder.exists():
+            folder = folder.parent
+        _temporary(path, folder).unlink()
 
 
 @functools.cache
@@ -172,9 +194,9 @@ def _storage_reason(error: Exception, folder: Path) -> str | None:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Write UTF-8 text atomically."""
+    """Write UTF-8 text atomically; what no UTF-8 can hold, such as odd file names, is escaped."""
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
@@ -189,7 +211,7 @@ def read_json(path: str | os.PathLike) -> Any:
         DataError: the file is missing or is not JSON.
     """
     try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
+        return json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise DataError(f"{path} does not exist.") from error
     except (OSError, ValueError, RecursionError) as error:

@@ -31,7 +31,8 @@ def cli(log_file: Path | None, threads: int | None):
     if log_file is not None:
         with storage_errors(log_file.parent):
             log_file.parent.mkdir(parents=True, exist_ok=True)
-            handlers.append(logging.FileHandler(log_file, encoding="utf-8"))
+            kept = {"encoding": "utf-8", "errors": "backslashreplace"}
+            handlers.append(logging.FileHandler(log_file, **kept))
         logging.raiseExceptions = False  # a log that fills the disk is not what to read about
     logging.basicConfig(
         level=logging.INFO,
@@ -54,6 +55,7 @@ for _module in (data, training, evaluation, reporting, registration):
 
 def main() -> None:
     """Entry point: user errors become one line on standard error."""
+    sys.stdout.reconfigure(errors="backslashreplace")  # file names may be no text
     try:
         cli(standalone_mode=False)
     except click.exceptions.Abort:

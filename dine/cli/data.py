@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from dine import config
-from dine.cli.options import FOLDER, IN, out_option, pairs_option, seed_option, settings_option
+from dine.cli.options import IN, OUT_FOLDER, out_option, pairs_option, seed_option, settings_option
 from dine.files import write_json
 
 
@@ -37,7 +37,7 @@ def inspect(folder: Path):
 @settings_option(config.Dataset)
 @click.option("--first-object", type=click.IntRange(0), default=0, help="First synthetic number.")
 @seed_option
-@out_option("The dataset's results folder.", FOLDER)
+@out_option("The dataset's results folder.", OUT_FOLDER)
 def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
     """Make, find or download raw meshes.
 

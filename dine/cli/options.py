@@ -13,10 +13,23 @@ import click
 
 from dine import config
 from dine.errors import ConfigError
+from dine.files import check_place
 
 IN = click.Path(exists=False, dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
-OUT = click.Path(path_type=Path)
+
+
+class _Output(click.Path):
+    """A path to write to: refused before anything is computed if that cannot be done."""
+
+    def convert(self, value, param, ctx):
+        path = super().convert(value, param, ctx)
+        check_place(path)
+        return path
+
+
+OUT = _Output(path_type=Path)
+OUT_FOLDER = _Output(file_okay=False, path_type=Path)
 
 
 class SectionType(click.ParamType):

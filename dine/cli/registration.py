@@ -11,6 +11,7 @@ from dine.cli.options import (
     FOLDER,
     IN,
     OUT,
+    OUT_FOLDER,
     compute_flags,
     compute_options,
     gathered,
@@ -83,7 +84,7 @@ def _alignment(prealign: str):
     from dine.geometry.rigid import check_rigid
 
     try:
-        return check_rigid(np.loadtxt(prealign), prealign)
+        return check_rigid(np.loadtxt(prealign, encoding="utf-8-sig"), prealign)
     except (OSError, ValueError) as error:
         raise DataError(
             f"--prealign {prealign} is neither auto nor off nor a readable text file of a 4×4 "
@@ -107,9 +108,9 @@ registration_options = gathered(
         "as the calibration was made with.",
     ),
     click.option(
-        "--surfaces",
-        is_flag=True,
-        help="Go on from the points to the surfaces; on trial, see docs/guide/register.md.",
+        "--surfaces/--no-surfaces",
+        default=True,
+        help="Go on from the points to the surfaces that they were drawn on; by default.",
     ),
     click.option("--partial", is_flag=True, help="The target shows a part of the source only."),
     click.option(
@@ -163,6 +164,7 @@ def register(source, target, out, further, settings, writing, load_model):
     a report (OUT.json) and, with --view, a page to look at (OUT.html).
     """
     from dine.io.readers import read_surface
+    from dine.io.writers import check_holds
     from dine.registration.output import Outputs, save
     from dine.registration.register import register as run
     from dine.registration.shapes import shapes_by_name
@@ -171,9 +173,11 @@ def register(source, target, out, further, settings, writing, load_model):
     shapes, landmarks = shapes_by_name(further["apply"]), further["landmarks"]
     outputs = Outputs(out)
     outputs.check(shapes, **writing)
-    marks = tuple(read_surface(path).vertices for path in landmarks) if landmarks else None
-    result = run(source, target, model=load_model(), apply=shapes, landmarks=marks, **settings)
-    said = save(result, outputs, colors_from=source, applied=shapes, **writing)
+    moving = read_surface(source)
+    check_holds(out, moving)
+    marks = landmarks or None
+    result = run(moving, target, model=load_model(), apply=shapes, landmarks=marks, **settings)
+    said = save(result, outputs, applied=shapes, **writing)
     report = result.report
     expected = result.trust.expected_error
     click.echo(
@@ -197,7 +201,7 @@ def register(source, target, out, further, settings, writing, load_model):
     """,
 )
 @click.argument("manifest", type=click.Path(exists=False, path_type=Path))
-@click.option("-o", "--out", type=FOLDER, required=True, help="Folder of all results.")
+@click.option("-o", "--out", type=OUT_FOLDER, required=True, help="Folder of all results.")
 @click.option("--suffix", default="", help="Format of the moved sources, such as .ply.")
 @registration_options
 @view_option

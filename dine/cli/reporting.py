@@ -8,6 +8,7 @@ from dine import config
 from dine.cli.options import (
     FOLDER,
     IN,
+    OUT_FOLDER,
     gathered,
     json_or_file,
     name_option,
@@ -53,7 +54,7 @@ def diagnose(prior, fields, pairs, facts, seed, out):
     default=config.Evaluation().training_spread,
     help="How much differences vary with the training (`evaluation.training_spread`).",
 )
-@out_option("Folder for CSV, Markdown and LaTeX.", FOLDER)
+@out_option("Folder for CSV, Markdown and LaTeX.", OUT_FOLDER)
 def tables(metrics, spread, out):
     """Aggregate metrics into the paper's tables and their companions.
 
@@ -75,7 +76,7 @@ results_option = click.option(
 @click.command()
 @results_option
 @settings_option(config.Config)
-@out_option("Folder for PNG and PDF.", FOLDER)
+@out_option("Folder for PNG and PDF.", OUT_FOLDER)
 def figures(results, settings, out):
     """Draw all figures of a finished run.
 
@@ -154,7 +155,7 @@ def examples(pairs, variants, names, predictions, methods, dataset, out):
 @click.option(
     "--settings", callback=json_or_file, metavar="JSON|FILE", help="Configuration to show."
 )
-@out_option("Folder for report, tables and figures.", FOLDER)
+@out_option("Folder for report, tables and figures.", OUT_FOLDER)
 def evidence(metrics, methods, reference, shown, settings, out):
     """Write the report on whether a prior helps: tests, tables, figures and findings.
 

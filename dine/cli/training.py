@@ -9,8 +9,8 @@ import click
 
 from dine import config
 from dine.cli.options import (
-    FOLDER,
     IN,
+    OUT_FOLDER,
     SectionType,
     batch_option,
     compute_flags,
@@ -52,7 +52,7 @@ def order_options(*options: Callable) -> Callable:
     return gathered("order", _order, seed_option, *compute, *options)
 
 
-run_options = order_options(name_option, out_option("Run folder.", FOLDER))
+run_options = order_options(name_option, out_option("Run folder.", OUT_FOLDER))
 
 
 @click.command()
@@ -76,7 +76,7 @@ def stage1(pairs, backbone, settings, order):
 @targets_option
 @backbone_option
 @settings_option(config.Pretraining)
-@order_options(out_option("Run folder.", FOLDER))
+@order_options(out_option("Run folder.", OUT_FOLDER))
 def pretrain(pairs, targets, backbone, settings, order):
     """Train weights to start Stage 1 from, on synthetic pairs with known displacement.
 

@@ -364,6 +364,7 @@ def _safe_path(text: str) -> PurePosixPath:
         raise ValueError("a backslash or control character")
     if text.startswith("/"):
         raise ValueError("an absolute path")
+    os.fsencode(text)  # half of a surrogate pair is refused
     path = PurePosixPath(text)
     if ".." in path.parts or not path.parts:
         raise ValueError("it leaves the folder")

@@ -258,7 +258,9 @@ def _sort_by_role(files: list[Path], left_out: _LeftOut) -> dict[str, list[Path]
     stems = {path.with_suffix("") for path in files if path.suffix.lower() == ".xyz"}
     for path in files:
         suffix = path.suffix.lower()
-        if suffix == ".triangle":
+        if re.search("[\ud800-\udfff]", str(path)):
+            left_out.append((path, "its name holds what is no text; rename it"))
+        elif suffix == ".triangle":
             if path.with_suffix("") not in stems:
                 left_out.append((path, "triangles without an .xyz file of the same name"))
         elif suffix in _ARCHIVES:

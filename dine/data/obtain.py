@@ -99,12 +99,12 @@ def write_inventory(inventory: Inventory, folder: Path) -> None:
     """Write what was found and what was left out as CSV."""
     files = Data(folder)
     with atomic_path(files.inventory) as temporary:
-        inventory.table().to_csv(temporary, index=False)
+        inventory.table().to_csv(temporary, index=False, errors="backslashreplace")
     left_out = pd.DataFrame(
         [(str(path), reason) for path, reason in inventory.left_out], columns=["file", "reason"]
     )
     with atomic_path(files.left_out) as temporary:
-        left_out.to_csv(temporary, index=False)
+        left_out.to_csv(temporary, index=False, errors="backslashreplace")
     log.info(
         "%d pairs found, %d files left out (listed in %s)",
         len(inventory.pairs),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -17,14 +18,24 @@ class Surface:
         vertices: (V, 3) float64, in the units of the file.
         faces: (F, 3) int64 vertex indices, or None for a cloud.
         name: where it came from, for messages.
+        data: what else is known of every vertex, by name: arrays of V rows. Vertex colours are
+            ``colors``, (V, 3) or (V, 4) uint8. Values are carried along as they are.
+        texture: (F, 3, 2) texture coordinates of every corner of every face, or None.
+        space: ``LPS`` or ``RAS`` where the file states its patient coordinates.
+        left_out: what the file holds beside that and is not here, in words for a message.
 
     Raises:
-        DataError: empty, wrong shape, not finite, or faces that point outside the vertices.
+        DataError: empty, wrong shape, not finite, faces that point outside the vertices, or data of
+            another number of rows.
     """
 
     vertices: np.ndarray
     faces: np.ndarray | None = None
     name: str = "surface"
+    data: Mapping[str, np.ndarray] = field(default_factory=dict)
+    texture: np.ndarray | None = None
+    space: str | None = None
+    left_out: tuple[str, ...] = ()
 
     def __post_init__(self):
         vertices = self._numbers("vertices", np.float64)
@@ -41,8 +52,18 @@ class Surface:
                 f"(first at index {int(bad.argmax())}); repair or remove the file."
             )
         object.__setattr__(self, "vertices", vertices)
+        for name, values in self.data.items():
+            if len(values) != len(vertices):
+                raise DataError(
+                    f"{self.name}: {len(values)} values of {name!r} do not fit {len(vertices)} "
+                    "vertices; expected one for each."
+                )
+        self._check_faces()
+
+    def _check_faces(self):
         if self.faces is None:
             return
+        vertices = self.vertices
         faces = self._numbers("faces", np.int64)
         if faces.size == 0:
             object.__setattr__(self, "faces", None)
@@ -55,6 +76,13 @@ class Surface:
                 f"{len(vertices)} vertices (indices start at 0)."
             )
         object.__setattr__(self, "faces", faces)
+
+    @property
+    def used(self) -> np.ndarray:
+        """Mask (V,) of the vertices that the object consists of: of a mesh those of its faces."""
+        if self.faces is None:
+            return np.ones(len(self.vertices), dtype=bool)
+        return np.bincount(self.faces.reshape(-1), minlength=len(self.vertices)) > 0
 
     def _numbers(self, name: str, dtype: type) -> np.ndarray:
         try:

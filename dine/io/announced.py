@@ -68,6 +68,7 @@ def hdf5(path: str | os.PathLike) -> Iterator[h5py.File]:
     Raises:
         DataError: a heap, or an object in one, is larger than what it lies in, or smaller than its
             own header.
+            Or the file is open in another program.
         OSError: no HDF5 file, or damaged in other ways.
     """
     if os.path.isfile(path) and os.path.getsize(path):
@@ -76,14 +77,25 @@ def hdf5(path: str | os.PathLike) -> Iterator[h5py.File]:
             mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content,
         ):
             _check_heaps(path, content)
-    with h5py.File(path, "r") as file:
+    try:
+        file = h5py.File(path, "r")
+    except BlockingIOError as error:
+        raise DataError(
+            f"{path} is open in another program that writes to it; close it there, and try again."
+        ) from error
+    with file:
         yield file
+
+
+def hdf5_start(content: bytes | mmap.mmap) -> int | None:
+    """Where HDF5 begins in a file, behind what other programs put first; None in other files."""
+    places = (0, *(512 << doublings for doublings in range(32)))
+    return next((at for at in places if content[at : at + 8] == _SIGNATURE), None)
 
 
 def _check_heaps(path: str | os.PathLike, content: mmap.mmap) -> None:
     """Walk through the global heaps as the library does (HDF5 file format 3.0, III.E)."""
-    places = (0, *(512 << doublings for doublings in range(32)))
-    begin = next((at for at in places if content[at : at + 8] == _SIGNATURE), None)
+    begin = hdf5_start(content)
     if begin is None or len(content) < begin + 16:
         return
     # Bytes of a length, after the version of the file's first block; other numbers are not written.
@@ -171,14 +183,14 @@ def npy_array(path: str | os.PathLike, content: bytes) -> np.ndarray:
     return np.lib.format.read_array(stream, allow_pickle=False)
 
 
-def member(path: str | os.PathLike, archive: zipfile.ZipFile, name: str) -> bytes:
-    """A member of a ZIP archive.
+def member(path: str | os.PathLike, archive: zipfile.ZipFile, name: str, *, stored: int) -> bytes:
+    """A member of a ZIP archive of so many bytes.
 
     Raises:
         DataError: it grows to more than compressed data can.
     """
     info = archive.getinfo(name)
-    check(path, f"its member {name!r}", info.compress_size, os.path.getsize(path))
+    check(path, f"its member {name!r}", info.compress_size, stored)
     check(path, f"its member {name!r}", info.file_size, limit(info.compress_size))
     return archive.read(info)
 
@@ -291,7 +303,7 @@ def check_pickled_sizes(path: str | os.PathLike, content: bytes) -> None:
     if content[:2] == b"PK":
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             streams = [
-                io.BytesIO(member(path, archive, name))
+                io.BytesIO(member(path, archive, name, stored=len(content)))
                 for name in archive.namelist()
                 if name.endswith("/data.pkl")
             ]

@@ -10,15 +10,16 @@ import itertools
 import lzma
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
 
 from dine.errors import DataError
-
-_Arrays = tuple[np.ndarray, np.ndarray | None]
+from dine.geometry.surface import Surface
+from dine.io import polygons, text
 
 _TYPES = {f"{k}{8 * n}": f"{c}{n}" for k, c in (("Int", "i"), ("UInt", "u")) for n in (1, 2, 4, 8)}
 _TYPES |= {"Float32": "f4", "Float64": "f8"}
@@ -32,8 +33,8 @@ _UNPACK: dict[str, Callable[[bytes], bytes]] = {
 }
 
 
-def read_vtp(path: Path) -> _Arrays:
-    """Vertices (V, 3) and triangles (F, 3) of XML PolyData; None for faces where there are none.
+def read_vtp(path: Path, data: bytes) -> Surface:
+    """A mesh or cloud of XML PolyData, with its point data.
 
     Arrays may be text, base64 or appended, raw or compressed (zlib, LZMA), of either byte order.
     Pieces follow each other; polygons and strips become triangles, lines are left out.
@@ -42,7 +43,7 @@ def read_vtp(path: Path) -> _Arrays:
         DataError: another kind of VTK data, or compressed with LZ4.
         ValueError: the file is damaged; so are a few other exceptions of the parsers.
     """
-    head, mark, appended = path.read_bytes().partition(b"<AppendedData")
+    head, mark, appended = data.partition(b"<AppendedData")
     # Raw appended data is no XML, so only what stands before it is parsed.
     root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
     if root.tag != "VTKFile":
@@ -57,6 +58,8 @@ def read_vtp(path: Path) -> _Arrays:
         )
     decode = _Decoder(root, appended)
     vertices, faces, count = [], [], 0
+    values: dict[str, list[np.ndarray]] = {}
+    left_out = dict.fromkeys(_named_arrays(root, "CellData", " of cells"))
     for piece in root.iterfind("PolyData/Piece"):
         announced = int(piece.get("NumberOfPoints", 0))
         if announced == 0:
@@ -64,16 +67,78 @@ def read_vtp(path: Path) -> _Arrays:
         points = decode(_array(piece, "Points")).reshape(-1, 3)
         if len(points) != announced:
             raise ValueError(f"{len(points)} points where {announced} are announced")
-        for kind, triangles in (("Polys", _fans), ("Strips", _strips)):
+        for kind, triangles in (("Polys", polygons.fans), ("Strips", polygons.strips)):
             if int(piece.get(f"NumberOf{kind}", 0)):
-                ends = decode(_array(piece, kind, "offsets"))
-                corners = decode(_array(piece, kind, "connectivity"))
-                faces.append(triangles(corners.astype(np.int64), ends.astype(np.int64)) + count)
+                ends = decode(_array(piece, kind, "offsets")).astype(np.int64)
+                corners = decode(_array(piece, kind, "connectivity")).astype(np.int64)
+                faces.append(_faces(corners, ends, triangles) + count)
+        left_out |= dict.fromkeys(["lines"] * bool(int(piece.get("NumberOfLines", 0))))
+        for name, array in _point_data(piece, decode, announced, left_out):
+            values.setdefault(name, []).append(array)
         vertices.append(points.astype(np.float64))
         count += len(points)
     if not vertices:
         raise DataError(f"{path} holds no points; expected PolyData, so export it again.")
-    return np.concatenate(vertices), np.concatenate(faces) if faces else None
+    whole = {name: np.concatenate(parts) for name, parts in values.items() if _fit(parts)}
+    for name in [name for name, array in whole.items() if len(array) != count]:
+        del whole[name]
+    left_out |= dict.fromkeys(name for name in values if name not in whole)
+    triangles = np.concatenate(faces) if faces else None
+    return Surface(
+        np.concatenate(vertices), triangles, str(path), _colored(whole), left_out=tuple(left_out)
+    )
+
+
+def _fit(parts: list[np.ndarray]) -> bool:
+    return len({part.shape[1:] for part in parts}) == 1
+
+
+def _faces(
+    corners: np.ndarray, ends: np.ndarray, triangles: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Triangles (F, 3) of cells given by their corners, and where each ends."""
+    if polygons.small(ends) or (len(ends) and np.diff(ends, prepend=0).min() < 1):
+        raise ValueError("a face has fewer than 3 corners")
+    if ends[-1] != len(corners):
+        raise ValueError(f"faces of {ends[-1]} corners where there are {len(corners)}")
+    return corners[triangles(ends)]
+
+
+def _colored(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The first array of 3 or 4 bytes a point is its colour, whatever its name."""
+    for name, array in values.items():
+        if array.dtype == np.uint8 and array.ndim == 2 and array.shape[1] in (3, 4):
+            return {"colors" if key == name else key: values[key] for key in values}
+    return values
+
+
+def _named_arrays(root: ElementTree.Element, part: str, what: str) -> list[str]:
+    return [f"{a.get('Name')}{what}" for a in root.iterfind(f"PolyData/Piece/{part}/DataArray")]
+
+
+def _point_data(
+    piece: ElementTree.Element, decode: _Decoder, count: int, left_out: dict[str, None]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays that are known of every point, by name; normals and texts are left out."""
+    for group in piece.iterfind("PointData"):
+        normals = group.get("Normals")
+        for array in group:
+            name, kind = array.get("Name", "values"), array.get("type", "")
+            if name == normals or name.lower() == "normals":
+                left_out["normals"] = None
+            elif array.tag != "DataArray" or kind not in _TYPES:
+                left_out[name] = None
+            else:
+                found = decode(array)
+                if len(found) % count:
+                    raise ValueError(f"{len(found)} numbers of {name} for {count} points")
+                yield name, _columns(found, len(found) // count)
+
+
+def _columns(values: np.ndarray, width: int) -> np.ndarray:
+    """Numbers of the machine's own byte order, a row a point."""
+    values = values.astype(values.dtype.newbyteorder("="))
+    return values if width == 1 else values.reshape(-1, width)
 
 
 def _other_data(path: Path, kind: str) -> DataError:
@@ -143,42 +208,16 @@ def _from_base64(text: bytes) -> bytes:
     return b"".join(map(binascii.a2b_base64, re.findall(rb"[^=]+={0,2}", text)))
 
 
-def _fans(corners: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Triangles (F, 3) of polygons: corners one after another, and where each polygon ends."""
-    first, step = _triangles(corners, ends)
-    return corners[np.column_stack([first, first + step + 1, first + step + 2])]
-
-
-def _strips(corners: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Triangles (F, 3) of strips, every second one turned round."""
-    first, step = _triangles(corners, ends)
-    start, odd = first + step, step % 2
-    return corners[np.column_stack([start, start + 1 + odd, start + 2 - odd])]
-
-
-def _triangles(corners: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each triangle, where its cell begins and its number in the cell."""
-    starts = np.concatenate([[0], ends[:-1]])
-    counts = ends - starts - 2
-    if (counts < 1).any():
-        raise ValueError("a face has fewer than 3 corners")
-    if ends[-1] != len(corners):
-        raise ValueError(f"faces of {ends[-1]} corners where there are {len(corners)}")
-    step = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.repeat(starts, counts), step
-
-
 # --- legacy files -----------------------------------------------------------------------------
 
 
-def read_vtk(path: Path) -> _Arrays:
-    """Vertices (V, 3) and triangles (F, 3) of a legacy PolyData file, text or binary.
+def read_vtk(path: Path, data: bytes) -> Surface:
+    """A mesh or cloud of a legacy PolyData file, text or binary, with its point data.
 
     Raises:
         DataError: another kind of VTK data.
         ValueError: the file is damaged; so are a few other exceptions of the parsers.
     """
-    data = path.read_bytes()
     if not data.startswith(b"# vtk DataFile"):
         raise ValueError("its first line is not that of a VTK file")
     _, _, coding, *rest = data.split(b"\n", 3)
@@ -192,13 +231,26 @@ def read_vtk(path: Path) -> _Arrays:
     if header is None or int(header[0]) == 0:
         raise DataError(f"{path} holds no points; expected PolyData, so export it again.")
     points = file.numbers(3 * int(header[0]), header[1]).reshape(-1, 3).astype(np.float64)
-    after_points, faces = file.place, []
-    for name, triangles in ((b"POLYGONS", _fans), (b"TRIANGLE_STRIPS", _strips)):
+    after_points, faces, left_out = file.place, [], {}
+    kinds = ((b"POLYGONS", polygons.fans), (b"TRIANGLE_STRIPS", polygons.strips))
+    for name, triangles in kinds:
         file.place = after_points
         header = file.line(name + rb"\s+(\d+)\s+(\d+)")
         if header is not None and int(header[1]):
-            faces.append(triangles(*file.cells(*map(int, header))))
-    return points, np.concatenate(faces) if faces else None
+            faces.append(_faces(*file.cells(*map(int, header)), triangles))
+    file.place = after_points
+    if file.line(rb"LINES\s+[1-9]\d*\s+(\d+)"):
+        left_out["lines"] = None
+    file.place = after_points
+    if file.line(rb"CELL_DATA\s+(\d+)") is not None:
+        left_out["data of cells"] = None
+    file.place = after_points
+    values = {}
+    if file.line(rb"POINT_DATA\s+" + str(len(points)).encode()) is not None:
+        values = _colored(dict(file.data_of(len(points), left_out)))
+    triangles = np.concatenate(faces) if faces else None
+    space = text.stated_space(data)
+    return Surface(points, triangles, str(path), values, None, space, tuple(left_out))
 
 
 class _Legacy:
@@ -222,10 +274,13 @@ class _Legacy:
             found = np.frombuffer(self.data, f">{name}", count, self.place)
             self.place += found.nbytes
             return found
-        words = self.data[self.place :].split(None, count)[:count]
+        if count == 0:
+            return np.empty(0, name)
+        words = self.data[self.place :].split(None, count)
         if len(words) < count:
             raise ValueError(f"{len(words)} numbers where {count} are announced")
-        return np.array(words).astype(name)
+        self.place = len(self.data) - (len(words[count]) if len(words) > count else 0)
+        return np.array(words[:count]).astype(name)
 
     def cells(self, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
         """Corners one after another, and where each cell ends."""
@@ -248,3 +303,53 @@ class _Legacy:
         if place != len(table):
             raise ValueError("the lengths of its cells do not add up")
         return np.delete(table, starts), np.append(starts[1:], place) - np.arange(1, first + 1)
+
+    def data_of(self, count: int, left_out: dict[str, None]) -> Iterator[tuple[str, np.ndarray]]:
+        """Arrays of so many points by name, from here on; what is none goes to ``left_out``."""
+        while (header := self.line(_ATTRIBUTE + rb"[ \t]+(\S[^\n]*?)")) is not None:
+            keyword, words = header[0].upper(), header[1].split()
+            if keyword == b"CELL_DATA":
+                return
+            if keyword == b"FIELD":
+                yield from self._fields(int(words[1]), count, left_out)
+                continue
+            name, width, kind = unquote(words[0].decode()), _WIDTHS.get(keyword, 1), words[-1]
+            if keyword in (b"COLOR_SCALARS", b"LOOKUP_TABLE"):
+                kind = b"unsigned_char" if self.binary else b"float"
+                width = int(words[1]) if keyword == b"COLOR_SCALARS" else 4
+            elif keyword == b"SCALARS":
+                kind, width = words[1], int(words[2]) if len(words) > 2 else 1
+                table = re.compile(rb"\s*LOOKUP_TABLE[^\n]*\n").match(self.data, self.place)
+                self.place = table.end() if table else self.place
+            elif keyword == b"TEXTURE_COORDINATES":
+                width = int(words[1])
+            rows = int(words[1]) if keyword == b"LOOKUP_TABLE" else count
+            found = _columns(self.numbers(rows * width, kind), width)
+            if keyword == b"COLOR_SCALARS" and not self.binary:
+                found = np.rint(255 * found.clip(0, 1)).astype(np.uint8)
+            if keyword == b"NORMALS":
+                left_out["normals"] = None
+            elif keyword != b"LOOKUP_TABLE":
+                yield name, found
+
+    def _fields(
+        self, arrays: int, count: int, left_out: dict[str, None]
+    ) -> Iterator[tuple[str, np.ndarray]]:
+        for _ in range(arrays):
+            header = self.line(rb"(\S+)[ \t]+(\d+)[ \t]+(\d+)[ \t]+([A-Za-z]\w*)")
+            if header is None:
+                raise ValueError("a field has fewer arrays than it announces")
+            name, width, rows = unquote(header[0].decode()), int(header[1]), int(header[2])
+            if header[3].lower() not in map(str.encode, _LEGACY_TYPES):
+                left_out[name] = None  # texts; what follows is found by its header
+                continue
+            found = self.numbers(rows * width, header[3])
+            if rows == count and width:
+                yield name, _columns(found, width)
+            else:
+                left_out[name] = None
+
+
+_ATTRIBUTE = rb"(SCALARS|COLOR_SCALARS|VECTORS|NORMALS|TEXTURE_COORDINATES|TENSORS6?|LOOKUP_TABLE"
+_ATTRIBUTE += rb"|GLOBAL_IDS|PEDIGREE_IDS|FIELD|CELL_DATA)"
+_WIDTHS = {b"VECTORS": 3, b"NORMALS": 3, b"TENSORS": 9, b"TENSORS6": 6}

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from urllib.parse import quote
 from xml.sax.saxutils import quoteattr
 
 import h5py
@@ -19,8 +21,10 @@ import scipy.io
 import trimesh
 
 from dine.errors import DataError, StorageError
-from dine.files import atomic_path
+from dine.files import atomic_path, check_place
 from dine.geometry.surface import Surface
+from dine.io.meshes import FACET
+from dine.io.text import format_suffix
 
 _RESERVED = {"vertices", "points", "faces", "colors", "displacement", "x", "y", "z"}
 _RESERVED |= {"red", "green", "blue", "alpha"}
@@ -30,14 +34,19 @@ _RESERVED |= {"red", "green", "blue", "alpha"}
 class _Content:
     surface: Surface
     colors: np.ndarray | None = None
-    scalars: dict[str, np.ndarray] = field(default_factory=dict)
+    data: dict[str, np.ndarray] = field(default_factory=dict)
     text: bool = False
+
+    @property
+    def statement(self) -> str:
+        """What tells 3D Slicer in which space the coordinates are; empty where that is unknown."""
+        return f"SPACE={self.surface.space}" if self.surface.space else ""
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything by name, as the array formats store it."""
         named = {"vertices": self.surface.vertices, "faces": self.surface.faces}
         named["colors"] = self.colors
-        return {name: value for name, value in named.items() if value is not None} | self.scalars
+        return {name: value for name, value in named.items() if value is not None} | self.data
 
 
 def check_output(
@@ -60,10 +69,27 @@ def check_output(
             f"{path} has the suffix '{path.suffix}', which is not written; use one of "
             f"{' '.join(suffixes)}."
         )
+    check_place(path)
     if path.is_dir():
         raise StorageError(f"{path} is a folder; name a file in it.")
     if path.exists() and not overwrite:
         raise StorageError(f"{path} exists already; choose another name, or allow overwriting it.")
+
+
+def check_holds(path: str | os.PathLike, surface: Surface) -> None:
+    """Refuse a format that cannot hold a surface.
+
+    Raises:
+        DataError: a cloud is to be written as STL.
+    """
+    if Path(path).suffix.lower() == ".stl" and surface.faces is None:
+        raise DataError(f"{path}: STL holds triangles only; write a cloud as .ply or .xyz.")
+
+
+def written_suffix(path: Path, otherwise: str) -> str:
+    """The suffix of a file that was read, if that format is written, too."""
+    suffix = format_suffix(path)
+    return suffix if suffix in SURFACE_SUFFIXES else otherwise
 
 
 def write_surface(path: str | os.PathLike, surface: Surface) -> None:
@@ -108,14 +134,16 @@ def write_moved(
     Args:
         path: a file with one of ``SURFACE_SUFFIXES``; missing folders are made.
         surface: the moved mesh or cloud, in its own units.
-        colors: (V, 3) or (V, 4) uint8 vertex colours, RGB or RGBA; see ``read_colors``.
-        scalars: (V,) numbers by name, a plain word. PLY, VTP, NPZ, HDF5 and MAT hold them.
+        colors: (V, 3) or (V, 4) uint8 vertex colours, RGB or RGBA; by default the surface's own.
+        scalars: (V,) numbers by name, a plain word. PLY, VTP, VTK, NPZ, HDF5 and MAT hold them,
+            and the surface's own data. Of two with one name the surface's is called ``source_…``.
         text: write PLY as text instead of binary.
         overwrite: replace a file that is there already.
 
     Returns:
         What the format cannot hold and was left out, in words for a message: "faces", "colors",
-        "shared vertices" or the name of a scalar. Empty if nothing was.
+        "shared vertices", the name of a scalar, or digits of large coordinates. Empty if nothing
+        was.
 
     Raises:
         DataError: unknown suffix, a cloud as STL, or arrays that do not fit the vertices.
@@ -123,26 +151,60 @@ def write_moved(
     """
     check_output(path, SURFACE_SUFFIXES, overwrite=overwrite)
     suffix = Path(path).suffix.lower()
-    content = _Content(
-        surface, _checked_colors(colors, surface), _checked(scalars, len(surface.vertices)), text
-    )
-    if suffix == ".stl" and surface.faces is None:
-        raise DataError(f"{path}: STL holds triangles only; write a cloud as .ply or .xyz.")
+    left_out: list[str] = []
+    content = _content(surface, colors, scalars, left_out, words=suffix not in _ANY_NAME)
+    check_holds(path, surface)
     with atomic_path(path) as temporary:
-        _WRITERS[suffix](temporary, content)
-    return tuple(_left_out(suffix, content))
+        _WRITERS[suffix](temporary, replace(content, text=text))
+    return (*_left_out(suffix, content), *left_out)
+
+
+def _content(
+    surface: Surface,
+    colors: np.ndarray | None,
+    scalars: Mapping[str, np.ndarray] | None,
+    left_out: list[str],
+    *,
+    words: bool,
+) -> _Content:
+    """The surface's own data beside what is given, which goes first where names are the same."""
+    count = len(surface.vertices)
+    data = _checked(scalars, count)
+    for name, values in surface.data.items():
+        if name == "colors" and _are_colors(values, count):
+            colors = values if colors is None else colors
+        elif values.dtype.kind in "fiub" and values.ndim in (1, 2):
+            data[_free(re.sub(r"\W+", "_", name, flags=re.ASCII) if words else name, data)] = values
+        else:
+            left_out.append(name)
+    return _Content(surface, _checked_colors(colors, surface), data)
+
+
+def _free(name: str, taken: Iterable[str]) -> str:
+    """A name that nothing else has."""
+    while name in _RESERVED or name in taken or not re.match("[A-Za-z]", name):
+        name = f"source_{name}"
+    return name
 
 
 def _left_out(suffix: str, content: _Content) -> list[str]:
-    left_out = []
-    if content.surface.faces is not None and suffix in _POINTS_ONLY:
+    surface, left_out = content.surface, []
+    if surface.faces is not None and suffix in _POINTS_ONLY:
         left_out.append("faces")
     if suffix == ".stl":
         left_out.append("shared vertices")
-    if content.colors is not None and suffix not in {*_HOLD_SCALARS, ".obj", ".glb"}:
+    if content.colors is not None and suffix not in {*_HOLD_DATA, ".obj", ".glb"}:
         left_out.append("colors")
-    if suffix not in _HOLD_SCALARS:
-        left_out += content.scalars
+    if surface.texture is not None and suffix not in (".obj", ".ply"):
+        left_out.append("texture coordinates")
+    if content.statement and suffix not in (".ply", ".obj", ".stl", ".vtk"):
+        left_out.append(f"that it is in {surface.space}")
+    if suffix not in _HOLD_DATA:
+        left_out += content.data
+    if suffix in _SINGLE:
+        loss = float(np.abs(surface.vertices - surface.vertices.astype(np.float32)).max())
+        if loss > _MUCH_LOST * float(np.ptp(surface.vertices[surface.used], axis=0).max()):
+            left_out.append(f"coordinates this large (it rounds them by up to {loss:.2g})")
     return left_out
 
 
@@ -192,31 +254,6 @@ def write_field(
             temporary.write_text(_vtp(surface, data), encoding="ascii")
 
 
-def read_colors(path: str | os.PathLike, surface: Surface) -> np.ndarray | None:
-    """The vertex colours of the file that a surface was read from.
-
-    Colours are decoration: anything that does not give one for each vertex of ``surface``, in its
-    order, gives None.
-
-    Returns:
-        (V, 4) uint8 RGBA, or None.
-    """
-    try:
-        loaded = trimesh.load(path, process=False, maintain_order=True, fix_texture=False)
-        if isinstance(loaded, trimesh.Scene) and len(loaded.geometry) == 1:
-            (loaded,) = loaded.dump()
-        if isinstance(loaded, trimesh.PointCloud):
-            colors = loaded.colors
-        else:
-            colors = loaded.visual.vertex_colors if loaded.visual.kind == "vertex" else None
-        same = np.array_equal(loaded.vertices, surface.vertices)
-    except Exception:  # the parsers raise nearly every exception; the surface itself was readable
-        return None
-    if colors is None or not same or np.shape(colors) != (len(surface.vertices), 4):
-        return None
-    return np.asarray(colors, dtype=np.uint8)
-
-
 def _checked(scalars: Mapping[str, np.ndarray] | None, count: int) -> dict[str, np.ndarray]:
     """Scalars as float64 arrays."""
     checked = {}
@@ -237,12 +274,16 @@ def _checked(scalars: Mapping[str, np.ndarray] | None, count: int) -> dict[str, 
     return checked
 
 
+def _are_colors(values: np.ndarray, count: int) -> bool:
+    return values.dtype == np.uint8 and values.shape in ((count, 3), (count, 4))
+
+
 def _checked_colors(colors: np.ndarray | None, surface: Surface) -> np.ndarray | None:
     if colors is None:
         return None
     colors = np.ascontiguousarray(colors)
     count = len(surface.vertices)
-    if colors.dtype != np.uint8 or colors.shape not in ((count, 3), (count, 4)):
+    if not _are_colors(colors, count):
         raise DataError(
             f"Vertex colors are {colors.dtype} of shape {colors.shape}; expected uint8 of shape "
             f"({count}, 3) or ({count}, 4)."
@@ -253,45 +294,77 @@ def _checked_colors(colors: np.ndarray | None, surface: Surface) -> np.ndarray |
 # --- formats ----------------------------------------------------------------------------------
 
 
+_PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
+_PLY_TYPES |= {"f4": "float", "f8": "double"}
+
+
 def _write_ply(path: Path, content: _Content) -> None:
     """Written here because trimesh stores vertices as float32 in PLY."""
-    columns = dict(zip("xyz", content.surface.vertices.T, strict=True))
+    surface = content.surface
+    columns = dict(zip("xyz", surface.vertices.T, strict=True))
     if content.colors is not None:
         columns |= dict(zip(("red", "green", "blue", "alpha"), content.colors.T, strict=False))
-    columns |= content.scalars
-    names = {"f8": "double", "u1": "uchar"}
+    for name, values in content.data.items():
+        columns |= _ply_columns(name, values)
     kinds = {name: column.dtype.str[1:] for name, column in columns.items()}
-    table = np.empty(len(content.surface.vertices), [(name, f"<{k}") for name, k in kinds.items()])
+    table = np.empty(len(surface.vertices), [(name, f"<{k}") for name, k in kinds.items()])
     for name, column in columns.items():
         table[name] = column
     tables = [table]
     header = ["ply", f"format {'ascii' if content.text else 'binary_little_endian'} 1.0"]
+    header += [f"comment {content.statement}"] * bool(content.statement)
     header += [f"element vertex {len(table)}"]
-    header += [f"property {names[kind]} {name}" for name, kind in kinds.items()]
-    if content.surface.faces is not None:
-        header += [f"element face {len(content.surface.faces)}"]
+    header += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in kinds.items()]
+    if surface.faces is not None:
+        header += [f"element face {len(surface.faces)}"]
         header += ["property list uchar int vertex_indices"]
-        rows = np.empty(len(content.surface.faces), [("count", "u1"), ("index", "<i4", 3)])
-        rows["count"], rows["index"] = 3, content.surface.faces
+        row = [("count", "u1"), ("index", "<i4", 3)]
+        if surface.texture is not None:
+            header += ["property list uchar double texcoord"]
+            row += [("numbers", "u1"), ("texture", "<f8", 6)]
+        rows = np.empty(len(surface.faces), row)
+        rows["count"], rows["index"] = 3, surface.faces
+        if surface.texture is not None:
+            rows["numbers"], rows["texture"] = 6, surface.texture.reshape(-1, 6)
         tables.append(rows)
     head = "\n".join([*header, "end_header", ""]).encode()
-    if not content.text:
+    if content.text:
+        lines = (" ".join(map(repr, _flat(row))) for table in tables for row in table.tolist())
+        path.write_bytes(head + "".join(f"{line}\n" for line in lines).encode())
+    else:
         path.write_bytes(head + b"".join(table.tobytes() for table in tables))
-        return
-    body = "".join(" ".join(map(repr, row)) + "\n" for row in table.tolist())
-    if content.surface.faces is not None:
-        body += "".join(f"3 {a} {b} {c}\n" for a, b, c in content.surface.faces.tolist())
-    path.write_bytes(head + body.encode())
+
+
+def _ply_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of types that PLY has."""
+    if values.dtype.str[1:] not in _PLY_TYPES:  # bool, float16 and integers of 64 bits
+        fits = values.dtype.kind in "iu" and abs(values).max(initial=0) < 2**31
+        values = values.astype({"b": "u1"}.get(values.dtype.kind, "i4" if fits else "f8"))
+    if values.ndim == 1:
+        return {name: values}
+    return {f"{name}_{i}": column for i, column in enumerate(values.T)}
+
+
+def _flat(row: tuple) -> list:
+    return [x for value in row for x in np.ravel(value).tolist()]
 
 
 def _write_obj(path: Path, content: _Content) -> None:
-    columns = content.surface.vertices
+    surface = content.surface
+    columns = surface.vertices
     if content.colors is not None:  # the common extension of "v x y z r g b", from 0 to 1
         columns = np.hstack([columns, content.colors[:, :3] / 255])
     with open(path, "w", encoding="ascii") as stream:
+        if content.statement:
+            stream.write(f"# {content.statement}\n")
         np.savetxt(stream, columns, fmt="v" + " %.17g" * columns.shape[1])
-        if content.surface.faces is not None:
-            np.savetxt(stream, content.surface.faces + 1, fmt="f %d %d %d")
+        if surface.texture is not None:
+            places, corner = np.unique(surface.texture.reshape(-1, 2), axis=0, return_inverse=True)
+            np.savetxt(stream, places, fmt="vt %.17g %.17g")
+            both = np.dstack([surface.faces, corner.reshape(-1, 3)]) + 1
+            np.savetxt(stream, both.reshape(-1, 6), fmt="f %d/%d %d/%d %d/%d")
+        elif surface.faces is not None:
+            np.savetxt(stream, surface.faces + 1, fmt="f %d %d %d")
 
 
 def _write_off(path: Path, content: _Content) -> None:
@@ -305,7 +378,19 @@ def _write_off(path: Path, content: _Content) -> None:
             np.savetxt(stream, faces, fmt="3 %d %d %d")
 
 
-def _write_trimesh(path: Path, content: _Content) -> None:
+def _write_stl(path: Path, content: _Content) -> None:
+    """Binary; the header says nothing that begins like a text file."""
+    corners = content.surface.vertices[content.surface.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets = np.zeros(len(corners), FACET)
+    facets["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    facets["corners"] = corners
+    header = f"DINE {content.statement}".encode().ljust(80) + len(facets).to_bytes(4, "little")
+    path.write_bytes(header + facets.tobytes())
+
+
+def _write_glb(path: Path, content: _Content) -> None:
     surface = content.surface
     if surface.faces is None:
         shape = trimesh.PointCloud(surface.vertices, colors=content.colors)
@@ -313,12 +398,46 @@ def _write_trimesh(path: Path, content: _Content) -> None:
         shape = trimesh.Trimesh(
             surface.vertices, surface.faces, vertex_colors=content.colors, process=False
         )
-    path.write_bytes(shape.export(file_type=path.suffix.lower()[1:]))
+    path.write_bytes(shape.export(file_type="glb"))
 
 
 def _write_vtp(path: Path, content: _Content) -> None:
     colors = {} if content.colors is None else {"colors": content.colors}
-    path.write_text(_vtp(content.surface, content.scalars | colors), encoding="ascii")
+    path.write_text(_vtp(content.surface, content.data | colors), encoding="utf-8")
+
+
+def _write_vtk(path: Path, content: _Content) -> None:
+    """A legacy file of version 3, binary, which every version of VTK reads."""
+    surface, count = content.surface, len(content.surface.vertices)
+    kind, cells = "VERTICES", np.arange(count)[:, None]
+    if surface.faces is not None:
+        kind, cells = "POLYGONS", surface.faces
+    table = np.insert(cells, 0, cells.shape[1], axis=1)
+    arrays = content.data if content.colors is None else content.data | {"colors": content.colors}
+    pieces: list[str | np.ndarray] = [
+        f"# vtk DataFile Version 3.0\nDINE {content.statement}\nBINARY\nDATASET POLYDATA\n",
+        f"POINTS {count} double\n",
+        surface.vertices.astype(">f8"),
+        f"\n{kind} {len(table)} {table.size}\n",
+        table.astype(">i4"),
+    ]
+    if arrays:
+        pieces.append(f"\nPOINT_DATA {count}\nFIELD FieldData {len(arrays)}\n")
+    for name, array in arrays.items():
+        values = _vtk_values(array)
+        words = f"{quote(name)} {values.size // count} {count} {_LEGACY[values.dtype.str[1:]]}\n"
+        pieces += [words, values.astype(values.dtype.newbyteorder(">")), "\n"]
+    path.write_bytes(b"".join(x.encode() if isinstance(x, str) else x.tobytes() for x in pieces))
+
+
+def _vtk_values(array: np.ndarray) -> np.ndarray:
+    """Numbers of a type that VTK has."""
+    return array.astype({"b": np.uint8, "f": np.float64}.get(array.dtype.kind, array.dtype))
+
+
+_LEGACY = {"f8": "double", "i1": "char", "u1": "unsigned_char", "i2": "short"}
+_LEGACY |= {"u2": "unsigned_short", "i4": "int", "u4": "unsigned_int", "i8": "vtktypeint64"}
+_LEGACY |= {"u8": "vtktypeuint64"}
 
 
 def _vtp(surface: Surface, data: dict[str, np.ndarray]) -> str:
@@ -352,7 +471,8 @@ def _vtp(surface: Surface, data: dict[str, np.ndarray]) -> str:
 
 
 def _vtp_array(name: str, array: np.ndarray) -> str:
-    kind = {"f8": "Float64", "i8": "Int64", "u1": "UInt8"}[array.dtype.str[1:]]
+    array = _vtk_values(array)
+    kind = {"f": "Float", "i": "Int", "u": "UInt"}[array.dtype.kind] + str(8 * array.itemsize)
     body = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")).tobytes()
     text = base64.b64encode(np.array(len(body), dtype="<u8").tobytes() + body).decode("ascii")
     columns = array.shape[1] if array.ndim == 2 else 1
@@ -382,16 +502,21 @@ def _write_table(path: Path, content: _Content) -> None:
     np.savetxt(path, content.surface.vertices, fmt="%.17g", delimiter=delimiter)
 
 
-_HOLD_SCALARS = (".ply", ".vtp", ".npz", ".h5", ".mat")
+_HOLD_DATA = (".ply", ".vtp", ".vtk", ".npz", ".h5", ".mat")
+_ANY_NAME = (".vtp", ".vtk")
+_SINGLE = (".stl", ".glb")
+# Of the object's extent; an object near the origin loses a thousandth of that.
+_MUCH_LOST = 1e-5
 _POINTS_ONLY = (".xyz", ".txt", ".csv", ".npy")
 
 _WRITERS: dict[str, Callable[[Path, _Content], None]] = {
     ".ply": _write_ply,
     ".obj": _write_obj,
     ".off": _write_off,
-    ".stl": _write_trimesh,
-    ".glb": _write_trimesh,
+    ".stl": _write_stl,
+    ".glb": _write_glb,
     ".vtp": _write_vtp,
+    ".vtk": _write_vtk,
     ".npz": lambda path, content: _savez(path, content.arrays()),
     ".h5": _write_h5,
     ".mat": _write_mat,

@@ -15,6 +15,7 @@ from dine.data.layout import scan
 from dine.data.manifest import read_manifest
 from dine.errors import DataError, DineError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json
+from dine.io.writers import written_suffix
 from dine.progress import Progress
 from dine.provenance import code_digest
 from dine.registration.output import Outputs, save
@@ -107,7 +108,8 @@ def register_many(
             progress.update()
     summary = pd.DataFrame(rows)
     with atomic_path(out / "summary.csv") as temporary:
-        summary.to_csv(temporary, index=False, float_format="%.6g")
+        form = {"float_format": "%.6g", "errors": "backslashreplace"}
+        summary.to_csv(temporary, index=False, **form)
     return summary
 
 
@@ -135,7 +137,7 @@ def _one(
             "view": view,
         }
     )
-    outputs = Outputs(folder / f"moved{suffix or job.source.suffix}")
+    outputs = Outputs(folder / f"moved{suffix or written_suffix(job.source, '.ply')}")
     mark = folder / _DONE
     if mark.is_file() and outputs.report.is_file():
         done = read_json(mark)
@@ -145,7 +147,7 @@ def _one(
     result = register(
         job.source, job.target, model=model, **settings, **(load(job) if load else {})
     )
-    save(result, outputs, colors_from=job.source, view=view, overwrite=True)
+    save(result, outputs, view=view, overwrite=True)
     row = _row(result)
     write_json(mark, {"identity": identity, "row": row})
     return row

@@ -14,9 +14,9 @@ from dine.geometry.surface import Surface
 from dine.io.writers import (
     SURFACE_SUFFIXES,
     check_output,
-    read_colors,
     write_field,
     write_moved,
+    written_suffix,
 )
 from dine.registration.types import RegistrationResult
 from dine.viewer.view import View, write_view
@@ -43,8 +43,11 @@ class Outputs:
     def view(self) -> Path:
         return self.beside("html")
 
-    def applied(self, name: str, suffix: str) -> Path:
-        return self.beside(f"{name}{suffix}")
+    def applied(self, name: str, given: Path | None) -> Path:
+        """In its own format where that is written, otherwise in that of the moved source."""
+        # What is no mesh may not fit into STL.
+        otherwise = ".ply" if self.moved.suffix.lower() == ".stl" else self.moved.suffix
+        return self.beside(f"{name}{written_suffix(given, otherwise) if given else '.ply'}")
 
     def check(self, applied: Mapping[str, Path], *, view: bool, overwrite: bool) -> None:
         """Refuse what could not be written, before anything is computed.
@@ -61,14 +64,16 @@ class Outputs:
         for path in others:
             check_output(path, [path.suffix], overwrite=overwrite)
         for name, path in applied.items():
-            check_output(self.applied(name, path.suffix), SURFACE_SUFFIXES, overwrite=overwrite)
+            further = self.applied(name, path)
+            if further in others:
+                raise DataError(f"{path} would become {further}, another output; rename it.")
+            check_output(further, SURFACE_SUFFIXES, overwrite=overwrite)
 
 
 def save(
     result: RegistrationResult,
     outputs: Outputs,
     *,
-    colors_from: Path | None = None,
     applied: Mapping[str, Path] | None = None,
     view: bool = False,
     overwrite: bool = False,
@@ -78,7 +83,6 @@ def save(
     Args:
         result: from ``register``.
         outputs: where to.
-        colors_from: the source's file, whose vertex colours are kept.
         applied: files of the further shapes, which say in what format to write them.
         view: write the page to look at, too.
         overwrite: replace files that are there already.
@@ -87,15 +91,11 @@ def save(
         Sentences on what a format could not hold.
     """
     scalars = _scalars(result)
-    colors = read_colors(colors_from, result.source) if colors_from else None
+    said = _lost(result.source)
     left_out = write_moved(
-        outputs.moved,
-        result.moved,
-        colors=colors,
-        scalars=_words(scalars),
-        overwrite=overwrite,
+        outputs.moved, result.moved, scalars=_words(scalars), overwrite=overwrite
     )
-    said = [f"{outputs.moved.name} cannot hold: {', '.join(left_out)}."] if left_out else []
+    said += _cannot_hold(outputs.moved, left_out)
     field = {
         "points": result.source.vertices,
         "displacement": result.displacement,
@@ -105,8 +105,9 @@ def save(
     for ending in ("field.npz", "field.vtp"):
         write_field(outputs.beside(ending), **field, overwrite=overwrite)
     for name, surface in result.applied.items():
-        suffix = applied[name].suffix if applied else ".ply"
-        write_moved(outputs.applied(name, suffix), surface, overwrite=overwrite)
+        path = outputs.applied(name, applied[name] if applied else None)
+        said += _lost(surface)
+        said += _cannot_hold(path, write_moved(path, surface, overwrite=overwrite))
     if view:
         shown = View(
             _aligned_source(result),
@@ -120,6 +121,17 @@ def save(
         write_view(outputs.view, shown, overwrite=overwrite)
     write_json(outputs.report, result.report)
     return said
+
+
+def _lost(surface: Surface) -> list[str]:
+    """What of a file was not read."""
+    if not surface.left_out:
+        return []
+    return [f"Not kept of {Path(surface.name).name}: {', '.join(surface.left_out)}."]
+
+
+def _cannot_hold(path: Path, left_out: tuple[str, ...]) -> list[str]:
+    return [f"{path.name} cannot hold: {', '.join(left_out)}."] if left_out else []
 
 
 def _aligned_source(result: RegistrationResult) -> Surface:

@@ -11,12 +11,21 @@ import numpy as np
 from dine import __version__
 from dine.files import file_digest
 from dine.geometry.distance import landmark_errors
+from dine.geometry.surface import Surface
 from dine.models.devices import chosen_device
 from dine.refinement.refine import ROUNDS
 from dine.registration.assessment import Measures, assess, expected_error, measure
 from dine.registration.correspondence import aligned_pair, correspond
 from dine.registration.model import load_model
-from dine.registration.shapes import POINTS, Shape, as_surface, check_sizes, checked_landmarks
+from dine.registration.shapes import (
+    POINTS,
+    Points,
+    Shape,
+    as_surface,
+    check_sizes,
+    check_spaces,
+    checked_landmarks,
+)
 from dine.registration.types import (
     Correspondence,
     Model,
@@ -35,7 +44,7 @@ def register(
     model: Model | None = None,
     prealign: str | np.ndarray = "auto",
     apply: Mapping[str, Shape] | None = None,
-    landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+    landmarks: tuple[Points, Points] | None = None,
     rounds: int = ROUNDS,
     surfaces: bool = False,
     partial: bool = False,
@@ -56,7 +65,8 @@ def register(
         prealign: ``auto`` (rigid, by iterative closest points), ``off``, or a rigid 4×4 matrix that
             brings the source to the target.
         apply: further shapes in the source's frame to move along, by name.
-        landmarks: corresponding (L, 3) points of source and target, to measure with only.
+        landmarks: corresponding (L, 3) points of source and target, or files of them, to measure
+            with only.
         rounds: of refinement at test time (most probable smooth field); 0 for the network's own.
         surfaces: go on from the points to the surfaces that they were drawn on (meshes), or to all
             points (clouds); not without rounds. On trial, see docs/guide/register.md.
@@ -80,13 +90,14 @@ def _registered(
     model: Model | None,
     settings: Settings,
     apply: Mapping[str, Shape],
-    landmarks: tuple[np.ndarray, np.ndarray] | None,
+    landmarks: tuple[Points, Points] | None,
 ) -> RegistrationResult:
     began = time.perf_counter()
     model = model or load_model()
     source, target = as_surface(source, "source"), as_surface(target, "target")
     further = {name: as_surface(shape, name) for name, shape in apply.items()}
-    marks = None if landmarks is None else checked_landmarks(landmarks)
+    marks = None if landmarks is None else checked_landmarks(landmarks, source, target)
+    check_spaces(source, (target, *further.values()))
     notes = check_sizes(source, target, settings.partial)
     pair = aligned_pair(source, target, settings, model.convention)
     correspondence = correspond(pair, model, settings)
@@ -148,12 +159,12 @@ def _report(
     model: Model,
 ) -> dict[str, Any]:
     """What the JSON report says, but for settings, landmarks and time."""
-    lengths = np.linalg.norm(displacement, axis=1)
+    lengths = np.linalg.norm(displacement, axis=1)[pair.source.used]
     alignment = pair.alignment
     return {
         "dine": __version__,
-        "source": {"name": pair.source.name, "vertices": len(pair.source.vertices)},
-        "target": {"name": pair.target.name, "vertices": len(pair.target.vertices)},
+        "source": _described(pair.source),
+        "target": _described(pair.target),
         "before": measures.before,
         "aligned": measures.aligned,
         "after": measures.after,
@@ -178,6 +189,11 @@ def _report(
         "prior": model.prior_path
         and {"file": model.prior_path.name, "sha256": file_digest(model.prior_path)},
     }
+
+
+def _described(surface: Surface) -> dict[str, Any]:
+    about = {"name": surface.name, "vertices": len(surface.vertices), "space": surface.space}
+    return about | {"left_out": list(surface.left_out)}
 
 
 def _landmarks(here: np.ndarray, there: np.ndarray, motion: Motion) -> dict[str, Any]:

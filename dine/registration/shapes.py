@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from dine.errors import ConfigError, DataError
 from dine.geometry.oriented import evenly
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
+from dine.io.slicer import in_space
+from dine.io.text import format_stem
 
 Shape = str | Path | Surface | np.ndarray | tuple[np.ndarray, np.ndarray]
 """A file, a surface, (V, 3) points, or vertices and faces."""
@@ -54,25 +56,57 @@ def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:
     Raises:
         ConfigError: two of the same stem.
     """
-    named = {path.stem: path for path in paths}
+    named = {format_stem(path): path for path in paths}
     if len(named) < len(paths):
         raise ConfigError("Two of the shapes to move along have the same name; rename one.")
     return named
 
 
-def checked_landmarks(landmarks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+Points = np.ndarray | str | Path
+"""(L, 3) points, or a file of them."""
+
+
+def checked_landmarks(
+    landmarks: tuple[Points, Points], source: Surface, target: Surface
+) -> tuple[np.ndarray, np.ndarray]:
     """Corresponding (L, 3) points of source and target, as float64.
 
+    Points of a file that states its space (LPS or RAS) are brought into that of the scan. 3D Slicer
+    takes scans that state none to be in LPS, and so it is here.
+
     Raises:
-        DataError: other shapes, or of different numbers.
+        DataError: unreadable, other shapes, or of different numbers.
     """
-    here, there = (np.asarray(x, dtype=np.float64) for x in landmarks)
+    scans = (source, target)
+    here, there = (_in_space_of(x, scan) for x, scan in zip(landmarks, scans, strict=True))
     if here.shape != there.shape or here.ndim != 2 or here.shape[1] != 3:
         raise DataError(
             f"The landmarks have shapes {here.shape} and {there.shape}; expected as many rows "
             "of three coordinates on the source as on the target, in the same order."
         )
+    if not (np.isfinite(here).all() and np.isfinite(there).all()):
+        raise DataError("The landmarks hold NaN or infinite coordinates; leave these points out.")
     return here, there
+
+
+def _in_space_of(points: Points, scan: Surface) -> np.ndarray:
+    if isinstance(points, str | Path):
+        return in_space(read_surface(points), scan.space or "LPS")
+    return np.asarray(points, dtype=np.float64)
+
+
+def check_spaces(source: Surface, others: Iterable[Surface]) -> None:
+    """Refuse scans that are stated to be in different patient coordinates.
+
+    Raises:
+        DataError: one is in LPS and one in RAS.
+    """
+    for other in others:
+        if None not in (source.space, other.space) and source.space != other.space:
+            raise DataError(
+                f"{source.name} is in {source.space} and {other.name} in {other.space}; export "
+                "both in the same coordinates."
+            )
 
 
 def check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
@@ -99,10 +133,11 @@ def check_sizes(source: Surface, target: Surface, partial: bool) -> list[str]:
 
 
 def _size(surface: Surface, what: str) -> float:
-    middle = np.median(surface.vertices, axis=0)
-    distance = np.linalg.norm(surface.vertices - middle, axis=1)
+    places = surface.vertices[surface.used]
+    middle = np.median(places, axis=0)
+    distance = np.linalg.norm(places - middle, axis=1)
     size = float(np.median(distance) or distance.mean())
-    if len(surface.vertices) == 1 or size <= 1e-12 * np.abs(middle).max():
+    if len(places) == 1 or size <= 1e-12 * np.abs(middle).max():
         raise DataError(
             f"All points of {surface.name}, the {what}, coincide; expected the surface of an "
             "object."
@@ -119,7 +154,8 @@ def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) ->
     """
     if points < FEWEST:
         raise ConfigError(f"The number of points is {points}; expected at least {FEWEST}.")
-    extent = surface.vertices - surface.vertices.mean(axis=0)
+    extent = surface.vertices[surface.used]
+    extent = extent - extent.mean(axis=0)
     widths = np.linalg.svd(extent, compute_uv=False)
     if widths[1] <= 1e-6 * widths[0]:
         raise DataError(

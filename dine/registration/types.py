@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +137,7 @@ class Motion:
 
     def surface(self, surface: Surface) -> Surface:
         """A surface with its vertices moved."""
-        return Surface(self(surface.vertices), surface.faces, name=surface.name)
+        return replace(surface, vertices=self(surface.vertices))
 
 
 @dataclass(frozen=True)

@@ -117,10 +117,12 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         _layer("source", "Source", source, rows, "#d08a3c", opacity=45, shown=False),
     ]
     shown = [
-        _scalar(name, values, len(result), rows, view.units.get(name, ""))
+        _scalar(name, values, source, rows, view.units.get(name, ""))
         for name, values in view.scalars.items()
     ]
-    every = np.concatenate([source.vertices, target.vertices, result])
+    # Vertices that no face uses are not drawn, wherever they lie.
+    shown_target = target.vertices[target.used]
+    every = np.concatenate([source.vertices[source.used], shown_target, result[source.used]])
     centre = (every.min(axis=0) + every.max(axis=0)) / 2
     radius = float(np.linalg.norm(every - centre, axis=1).max()) or 1.0
 
@@ -137,7 +139,7 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         "scalars": shown,
         "layers": layers,
         "colormap": _colors(),
-        "view": _viewpoint(target.vertices),
+        "view": _viewpoint(shown_target),
     }
 
 
@@ -196,16 +198,17 @@ def _layer(
 
 
 def _scalar(
-    name: str, values: np.ndarray, count: int, rows: np.ndarray, unit: str
+    name: str, values: np.ndarray, source: Surface, rows: np.ndarray, unit: str
 ) -> dict[str, Any]:
     """A scalar with the range of its colour bar and how many of all values it leaves out."""
-    values = np.asarray(values, dtype=np.float64)
+    values, count = np.asarray(values, dtype=np.float64), len(source.vertices)
     if values.shape != (count,):
         raise DataError(
             f"The scalar {name!r} has the shape {values.shape}; expected one number for each of "
             f"{count} source vertices."
         )
-    known = values[np.isfinite(values)]
+    drawn = values[source.used]
+    known = drawn[np.isfinite(drawn)]
     low, high, over = 0.0, 1.0, 0
     if known.size:
         low, high = float(known.min()), float(known.max())
@@ -222,7 +225,7 @@ def _scalar(
         "low": low,
         "high": high,
         "over": over,
-        "missing": int(count - known.size),
+        "missing": int(drawn.size - known.size),
         "values": _array(np.where(np.isfinite(values), values, np.nan)[rows], "float32"),
     }
 

@@ -6,14 +6,17 @@ A reader returns nothing. It raises one of our errors where the file is refused,
 
 from __future__ import annotations
 
+import base64
 import functools
 import gzip
 import io
 import json
 import os
+import struct
 import tarfile
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -39,7 +42,7 @@ from dine.data.raw import synthesise
 from dine.evaluation.predictions import FORMAT, Prediction, put_prediction, read_predictions
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
-from dine.io.writers import write_surface
+from dine.io.writers import write_moved, write_surface
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior
@@ -73,12 +76,16 @@ def surface(path: Path) -> None:
     assert found.vertices.shape[1] == 3
     assert len(found.vertices) > 0
     assert np.isfinite(found.vertices).all()
+    assert all(len(values) == len(found.vertices) for values in found.data.values())
+    assert found.texture is None or found.texture.shape == (len(found.faces), 3, 2)
     if found.faces is not None:
         assert found.faces.dtype == np.int64
         assert found.faces.shape == (len(found.faces), 3)
         assert 0 <= found.faces.min() <= found.faces.max() < len(found.vertices)
     # Nothing comes from nowhere: a vertex or a face takes two bytes of text at least.
     stored = sum(file.stat().st_size for file in path.parent.iterdir())
+    if path.suffix == ".gz":
+        stored = 100 * stored
     assert found.vertices.size <= 200 * stored
 
 
@@ -102,13 +109,119 @@ def plys() -> list[bytes]:
         "property list uchar int vertex_indices\nend_header\n"
         "0 0 0 1\n1 0 0 1\n1 1 0 1\n0 1 0 1\n4 0 1 2 3\n3 0 1 2\n"
     )
+    strips = text.replace("element face 2", "element tristrips 1").replace("uchar int", "int int")
+    strips = strips.replace("4 0 1 2 3\n3 0 1 2\n", "5 0 1 2 -1 3\n")
     return [
+        mixed_ply(BOX.vertices),
+        strips.encode(),
         written(lambda path: write_surface(path, own), ".ply"),
         written(lambda path: write_surface(path, Surface(BOX.vertices)), ".ply"),
         coloured.export(file_type="ply", vertex_normal=True),
         BOX.export(file_type="ply", encoding="ascii"),
         text.encode(),
     ]
+
+
+def mixed_ply(vertices: np.ndarray) -> bytes:
+    """Binary, with triangles, squares and what vertices hold beside."""
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz")
+    head += "element face 3\nproperty list uchar int vertex_indices\nend_header\n"
+    cells = ([0, 1, 2], [0, 1, 2, 3], [4, 5, 6])
+    rows = b"".join(struct.pack(f"<B{len(c)}i", len(c), *c) for c in cells)
+    return head.encode() + vertices.astype("<f8").tobytes() + rows
+
+
+def everything() -> Surface:
+    """The box with all that a file can hold of its vertices."""
+    count = len(BOX.vertices)
+    data = {"label": np.arange(count), "colors": np.full((count, 3), 9, np.uint8)}
+    data["pair"] = np.ones((count, 2))
+    return Surface(BOX.vertices, BOX.faces, data=data, space="LPS")
+
+
+def moved(suffix: str) -> Callable[[], list[bytes]]:
+    """As we write it, with everything and as a cloud."""
+
+    def make() -> list[bytes]:
+        shapes = (everything(), Surface(BOX.vertices))
+        return [
+            written(lambda path, x=shape: write_moved(path, x, overwrite=True), suffix)
+            for shape in shapes
+        ]
+
+    return make
+
+
+def samples(suffix: str) -> list[bytes]:
+    """Those of VTK itself that are read."""
+    folder = ROOT / "tests" / "data" / "vtk"
+    names = sorted(folder.glob(f"*{suffix}"))
+    return [p.read_bytes() for p in names if not p.name.startswith(("grid", "raw_lz4"))]
+
+
+def pcds() -> list[bytes]:
+    count = len(BOX.vertices)
+    head = "VERSION 0.7\nFIELDS x y z rgb\nSIZE 8 8 8 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    head += f"WIDTH {count}\nHEIGHT 1\nPOINTS {count}\nDATA "
+    rows = np.zeros(count, [("p", "<f8", 3), ("rgb", "<u4")])
+    rows["p"] = BOX.vertices
+    packed = BOX.vertices.T.tobytes() + bytes(4 * count)
+    runs = b"".join(b"\x1f" + packed[i : i + 32] for i in range(0, len(packed) // 32 * 32, 32))
+    rest = packed[len(packed) // 32 * 32 :]
+    runs += bytes([len(rest) - 1]) + rest if rest else b""
+    sizes = struct.pack("<2I", len(runs), len(packed))
+    text = "".join("{} {} {} 255\n".format(*row) for row in BOX.vertices.tolist())
+    return [
+        f"{head}ascii\n{text}".encode(),
+        f"{head}binary\n".encode() + rows.tobytes(),
+        f"{head}binary_compressed\n".encode() + sizes + runs,
+    ]
+
+
+def fcsvs() -> list[bytes]:
+    head = "# Markups fiducial file version = 4.11\n# CoordinateSystem = LPS\n"
+    head += "# columns = id,x,y,z,label\n"
+    rows = "".join("p,{},{},{},F\n".format(*row) for row in BOX.vertices.tolist())
+    return [(head + rows).encode()]
+
+
+def mrks() -> list[bytes]:
+    points = [
+        {"label": "F", "position": row, "positionStatus": "defined"}
+        for row in BOX.vertices.tolist()
+    ]
+    return [
+        json.dumps({"markups": [{"coordinateSystem": "RAS", "controlPoints": points}]}).encode()
+    ]
+
+
+def giftis() -> list[bytes]:
+    def array(intent: str, kind: str, values: np.ndarray, packed: bool) -> str:
+        body = zlib.compress(values.tobytes()) if packed else values.tobytes()
+        return (
+            f'<DataArray Intent="NIFTI_INTENT_{intent}" DataType="NIFTI_TYPE_{kind}" '
+            f'ArrayIndexingOrder="RowMajorOrder" Dimensionality="2" Dim0="{len(values)}" Dim1="3" '
+            f'Encoding="{"GZip" * packed}Base64Binary" Endian="LittleEndian">'
+            f"<Data>{base64.b64encode(body).decode()}</Data></DataArray>"
+        )
+
+    points, faces = BOX.vertices.astype("<f4"), BOX.faces.astype("<i4")
+    return [
+        (
+            '<GIFTI Version="1.0">'
+            + array("POINTSET", "FLOAT32", points, packed)
+            + array("TRIANGLE", "INT32", faces, packed)
+            + "</GIFTI>"
+        ).encode()
+        for packed in (False, True)
+    ]
+
+
+def freesurfers() -> list[bytes]:
+    sizes = struct.pack(">2i", len(BOX.vertices), len(BOX.faces))
+    body = BOX.vertices.astype(">f4").tobytes() + BOX.faces.astype(">i4").tobytes()
+    return [b"\xff\xff\xfecreated by someone\n\n" + sizes + body + b"volume"]
 
 
 def objs() -> list[bytes]:
@@ -618,6 +731,17 @@ TARGETS: dict[str, Target] = {
     "obj": Target("a.obj", objs, m.TEXT, surface),
     "off": Target("a.off", exported("off"), m.TEXT, surface),
     "stl": Target("a.stl", exported("stl", "stl_ascii"), m.TEXT, surface),
+    "vtp": Target("a.vtp", lambda: [*moved(".vtp")(), *samples(".vtp")], m.TEXT, surface),
+    "vtk": Target("a.vtk", lambda: [*moved(".vtk")(), *samples(".vtk")], m.TEXT, surface),
+    "gifti": Target("a.gii", giftis, m.TEXT, surface),
+    "freesurfer": Target("lh.pial", freesurfers, m.BYTES, surface),
+    "pcd": Target("a.pcd", pcds, m.TEXT, surface),
+    "pts": Target(
+        "a.pts", lambda: [b"26\n" + table(" ", 4), b"X;Y;Z\n" + table(";", 3)], m.TEXT, surface
+    ),
+    "fcsv": Target("a.fcsv", fcsvs, m.TEXT, surface),
+    "mrk": Target("a.mrk.json", mrks, m.JSON, surface),
+    "gz": Target("a.ply.gz", lambda: [gzip.compress(x) for x in plys()], m.BYTES, surface),
     "gltf": Target("a.gltf", gltfs, m.JSON, surface),
     "glb": Target("a.glb", glbs, (*m.BYTES, *5 * (m.glb_json,)), surface),
     "xyz": Target(

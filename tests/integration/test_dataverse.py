@@ -322,6 +322,7 @@ def test_restricted_files_are_named_at_the_end(server, tmp_path):
         (None, ".."),
         (None, ""),
         ("a", "b\n.ply"),
+        ("a", "\ud800.ply"),
     ],
 )
 def test_hostile_names_are_refused_before_anything_is_written(server, tmp_path, folder, label):

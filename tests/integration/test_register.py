@@ -2,6 +2,10 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -19,15 +23,16 @@ from dine.geometry.frame import Frame
 from dine.geometry.rigid import Alignment, check_rigid, rigid_alignment, transformed
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
-from dine.io.writers import write_surface
+from dine.io.writers import write_moved, write_surface
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import save_backbone
 from dine.priors import GaussianProcessPrior, PCAPrior
 from dine.refinement.refine import ROUNDS
+from dine.registration import register as register_module
 from dine.registration.assessment import DOUBTFUL, GOOD, IMPLAUSIBLE, assess
 from dine.registration.calibration import Calibration, load_calibration, plausibility
 from dine.registration.model import load_model
-from dine.registration.shapes import near_points
+from dine.registration.shapes import checked_landmarks, near_points
 
 pytestmark = pytest.mark.numerical
 POINTS = 1024
@@ -444,6 +449,61 @@ def test_a_calibration_counts_only_where_it_applies(pair, result):
     assert not other.trust.percentiles
 
 
+@pytest.mark.parametrize("kind", ["one far away", "an uncompacted crop", "a line"])
+def test_vertices_without_faces_take_no_part(pair, result, kind):
+    source, target = pair
+    strays = {
+        "one far away": np.full((1, 3), 1e6),
+        "an uncompacted crop": source.vertices + np.array([5, 0, 0]),
+        "a line": np.linspace(0, 1e3, 5000)[:, None] * [1, 0, 0],
+    }[kind]
+    more = [Surface(np.vstack([x.vertices, strays]), x.faces, name=x.name) for x in pair]
+    for stray_source, stray_target in ((more[0], target), (source, more[1])):
+        found = dine.register(stray_source, stray_target, points=POINTS)
+        count = len(source.vertices)
+        assert len(found.moved.vertices) == len(stray_source.vertices)
+        np.testing.assert_allclose(found.moved.vertices[:count], result.moved.vertices, atol=1e-6)
+        assert found.trust.verdict == result.trust.verdict
+        assert found.trust.reasons == result.trust.reasons
+        assert found.report["displacement"]["max"] == pytest.approx(
+            result.report["displacement"]["max"], rel=1e-6
+        )
+
+
+def test_landmarks_are_checked_before_anything_is_computed(pair, monkeypatch):
+    monkeypatch.setattr(register_module, "aligned_pair", lambda *args: pytest.fail("computed"))
+    points = pair[0].vertices[:5]
+    for marks in ((points, points[:4]), (points[:, :2], points[:, :2])):
+        with pytest.raises(DataError, match="expected as many rows of three coordinates"):
+            dine.register(*pair, landmarks=marks)
+
+
+def test_landmarks_of_slicer_come_into_the_space_of_their_scan(pair, tmp_path):
+    source, target = pair
+    head = "# Markups fiducial file version = 4.11\n# CoordinateSystem = {}\n# columns = id,x,y,z\n"
+    for name, surface in zip(("a.fcsv", "b.fcsv"), pair, strict=True):
+        rows = surface.vertices[:5] * [-1, -1, 1]
+        lines = "".join("p,{},{},{}\n".format(*row) for row in rows.tolist())
+        (tmp_path / name).write_text(head.format("RAS") + lines)
+    files = tmp_path / "a.fcsv", tmp_path / "b.fcsv"
+    for space in (None, "LPS"):  # 3D Slicer takes what is not stated for LPS
+        scans = [dataclasses.replace(surface, space=space) for surface in pair]
+        here, there = checked_landmarks(files, *scans)
+        np.testing.assert_array_equal(here, source.vertices[:5])
+        np.testing.assert_array_equal(there, target.vertices[:5])
+    scans = [dataclasses.replace(surface, space="RAS") for surface in pair]
+    here, _ = checked_landmarks(files, *scans)
+    np.testing.assert_array_equal(here, source.vertices[:5] * [-1, -1, 1])
+
+
+def test_scans_of_different_spaces_are_refused(pair):
+    lps, ras = (dataclasses.replace(x, space=s) for x, s in zip(pair, ("LPS", "RAS"), strict=True))
+    with pytest.raises(DataError, match="organ is in LPS and deformed organ in RAS; export both"):
+        dine.register(lps, ras)
+    with pytest.raises(DataError, match="is in LPS and deformed organ in RAS"):
+        dine.register(lps, pair[1], apply={"other": ras})
+
+
 # --- commands -------------------------------------------------------------------------------------
 
 
@@ -476,6 +536,81 @@ def test_command_writes_everything(files, tmp_path, pair):
     # The same settings as from Python, for which the shipped weights are calibrated.
     assert report["settings"]["rounds"] == ROUNDS
     assert report["trust"]["expected_error"] > 0
+
+
+def test_command_writes_further_shapes_as_they_can_be(files, tmp_path, pair):
+    """Formats that are read but not written are written as the moved source is."""
+    cloud = tmp_path / "marks.pts"
+    cloud.write_text("20\n" + 20 * "0.1 0.2 0.3 9\n")
+    vtk = tmp_path / "tumour.vtk"
+    write_moved(vtk, pair[0])
+    for suffix, expected in ((".ply", ".ply"), (".vtp", ".vtp"), (".stl", ".ply")):
+        out = tmp_path / suffix[1:] / f"moved{suffix}"
+        done = run("register", *files, "-o", out, "--points", 64, "--apply", cloud, "--apply", vtk)
+        assert done.exit_code == 0, done.output
+        assert len(read_surface(out.with_suffix(f".marks{expected}")).vertices) == 20
+        assert (read_surface(out.with_suffix(".tumour.vtk")).faces == pair[0].faces).all()
+        assert "Not kept of marks.pts: column 4." in done.output
+
+
+def test_command_keeps_what_is_known_of_vertices(files, tmp_path, pair):
+    label = np.arange(len(pair[0].vertices)) % 7
+    colors = np.full((len(label), 3), [1, 2, 3], dtype=np.uint8)
+    data = {"label": label, "colors": colors}
+    write_moved(files[0], dataclasses.replace(pair[0], data=data), overwrite=True)
+    out = tmp_path / "moved.vtp"
+    assert run("register", *files, "-o", out, "--points", 64).exit_code == 0
+    found = read_surface(out).data
+    np.testing.assert_array_equal(found["label"], label)
+    np.testing.assert_array_equal(found["colors"], colors)
+    assert "distance_to_target" in found
+    out = tmp_path / "other.obj"
+    done = run("register", *files, "-o", out, "--points", 64)
+    assert "other.obj cannot hold: " in done.output
+    assert "label" in done.output
+
+
+def test_command_probes_its_output_first(files, tmp_path, monkeypatch):
+    monkeypatch.setattr(register_module, "aligned_pair", lambda *args: pytest.fail("computed"))
+    (tmp_path / "afile").write_text("precious")
+    np.savetxt(tmp_path / "cloud.xyz", organ().vertices)
+    for source, out, said in (
+        (files[0], tmp_path / "afile" / "m.ply", "a part of the path is a file, not a folder"),
+        (files[0], tmp_path / "afile" / "new" / "m.ply", "a part of the path is a file"),
+        (files[0], tmp_path / f"{'n' * 300}.ply", "the name is too long"),
+        (files[0], tmp_path / "new" / f"{'n' * 245}.ply", "the name is too long"),
+        (tmp_path / "cloud.xyz", tmp_path / "m.stl", "STL holds triangles only"),
+    ):
+        done = run("register", source, files[1], "-o", out)
+        assert isinstance(done.exception, DineError), done.output
+        assert said in str(done.exception)
+    for arguments in (
+        ("fields", "--model", "m", "--pairs", "p", "--out", tmp_path / "afile" / "dvf.h5"),
+        ("register-many", "pairs.csv", "-o", tmp_path / "afile" / "out"),
+    ):
+        done = run(*arguments)
+        assert isinstance(done.exception, DineError)
+        assert "a part of the path is a file" in str(done.exception)
+    assert (tmp_path / "afile").read_text() == "precious"
+    assert not (tmp_path / "new").exists()
+
+
+def test_names_that_are_no_text(files, tmp_path):
+    """Linux lets names be any bytes; they come out escaped wherever text is written."""
+    odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/sc\xffan.ply"))
+    try:
+        files[0].rename(odd)
+    except OSError:
+        pytest.skip("this file system takes text only")
+    out = odd.with_name(f"moved {odd.name}")
+    command = [sys.executable, "-m", "dine", "--log", tmp_path / "log", "register", odd, files[1]]
+    command += ["-o", out, "--view", "--points", "64"]
+    utf8 = os.environ | {"PYTHONIOENCODING": "utf-8:strict"}
+    done = subprocess.run(command, capture_output=True, env=utf8)
+    assert done.returncode == 0, done.stderr
+    assert rb"moved sc\udcffan.ply: HD95" in done.stdout
+    assert rb"sc\udcffan.ply" in out.with_suffix(".html").read_bytes()
+    assert json.loads(out.with_suffix(".json").read_text())["source"]["name"] == str(odd)
 
 
 def test_command_keeps_what_exists(files, tmp_path):

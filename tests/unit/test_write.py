@@ -1,4 +1,5 @@
 import base64
+import re
 from xml.etree import ElementTree
 
 import h5py
@@ -14,7 +15,6 @@ from dine.io.writers import (
     FIELD_SUFFIXES,
     SURFACE_SUFFIXES,
     check_output,
-    read_colors,
     write_field,
     write_moved,
 )
@@ -43,7 +43,19 @@ def assert_same(surface, expected, suffix=".ply"):
 
 
 def test_what_is_written_can_be_read():
-    everywhere = {".ply", ".obj", ".off", ".stl", ".glb", ".vtp", ".npz", ".npy", ".h5", ".mat"}
+    everywhere = {
+        ".ply",
+        ".obj",
+        ".off",
+        ".stl",
+        ".glb",
+        ".vtp",
+        ".vtk",
+        ".npz",
+        ".npy",
+        ".h5",
+        ".mat",
+    }
     everywhere |= TABLES
     assert set(SURFACE_SUFFIXES) == everywhere
     assert everywhere <= set(READABLE_SUFFIXES)
@@ -93,7 +105,7 @@ def test_ply_holds_everything(tmp_path, surface, colors, text):
     raw = trimesh.load(path, process=False).metadata["_ply_raw"]["vertex"]["data"]
     for name, values in SCALARS.items():
         np.testing.assert_array_equal(np.ravel(raw[name]), values)
-    found = read_colors(path, read_surface(path))
+    found = read_surface(path).data.get("colors")
     if colors is None:
         assert found is None
     else:
@@ -107,21 +119,101 @@ def test_ply_holds_everything(tmp_path, surface, colors, text):
 def test_colors_come_back(tmp_path, suffix, surface):
     path = tmp_path / f"a{suffix}"
     assert write_moved(path, surface, colors=COLORS[:, :3]) == ()
-    found = read_colors(path, read_surface(path))
-    np.testing.assert_array_equal(found, np.insert(COLORS[:, :3], 3, 255, axis=1))
+    found = read_surface(path).data["colors"]
+    np.testing.assert_array_equal(found[:, :3], COLORS[:, :3])
+    assert found.shape == (6, 3) or (found[:, 3] == 255).all()
 
 
-def test_files_without_fitting_colors(tmp_path):
-    write_moved(tmp_path / "a.ply", MESH)
-    write_moved(tmp_path / "b.ply", MESH, colors=COLORS)
-    (tmp_path / "bad.ply").write_bytes(b"ply\n")
-    other = Surface(VERTICES[::-1].copy(), FACES)
-    assert read_colors(tmp_path / "a.ply", MESH) is None
-    assert read_colors(tmp_path / "b.ply", other) is None
-    assert read_colors(tmp_path / "bad.ply", MESH) is None
-    assert read_colors(tmp_path / "none.ply", MESH) is None
-    np.savetxt(tmp_path / "a.xyz", VERTICES)
-    assert read_colors(tmp_path / "a.xyz", CLOUD) is None
+KEPT = {
+    "quality": np.linspace(0, 1, 6, dtype=np.float32),
+    "label": np.array([1, 2, 3, 1, 2, 300], dtype=np.int32),
+    "pair": np.arange(12, dtype=np.float64).reshape(6, 2),
+    "flag": np.array([1, 0, 1, 0, 1, 0], dtype=np.uint8),
+}
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".vtp", ".vtk", ".npz", ".h5", ".mat"])
+@pytest.mark.parametrize("faces", [None, FACES], ids=["cloud", "mesh"])
+def test_what_a_file_holds_of_its_vertices_comes_through(tmp_path, suffix, faces):
+    source = Surface(VERTICES, faces, data=KEPT | {"colors": COLORS})
+    assert write_moved(tmp_path / f"a{suffix}", source, scalars=SCALARS) == ()
+    found = read_surface(tmp_path / f"a{suffix}")
+    kept = dict(found.data)
+    if suffix == ".ply":
+        kept["pair"] = np.column_stack([kept.pop("pair_0"), kept.pop("pair_1")])
+    assert kept.keys() == {*KEPT, "colors", *SCALARS}
+    for name, values in (KEPT | {"colors": COLORS} | SCALARS).items():
+        np.testing.assert_array_equal(kept[name], values)
+    # And once more, through what was read.
+    assert write_moved(tmp_path / f"b{suffix}", found) == ()
+    again = read_surface(tmp_path / f"b{suffix}")
+    assert again.data.keys() == found.data.keys()
+    assert_same(again, source)
+
+
+def test_names_of_a_files_own_data(tmp_path):
+    own = {"error": np.arange(6.0), "x": np.ones(6), "Gaussian curvature": np.zeros(6)}
+    own |= {"9": np.full(6, 9.0), "words": np.array(list("abcdef"))}
+    source = Surface(VERTICES, data=own)
+    assert write_moved(tmp_path / "a.ply", source, scalars=SCALARS) == ("words",)
+    found = read_surface(tmp_path / "a.ply").data
+    assert found.keys() == {
+        "error",
+        "seen",
+        "source_error",
+        "source_x",
+        "Gaussian_curvature",
+        "source_9",
+    }
+    np.testing.assert_array_equal(found["error"], SCALARS["error"])
+    np.testing.assert_array_equal(found["source_error"], own["error"])
+    for suffix in (".vtp", ".vtk"):
+        assert write_moved(tmp_path / f"a{suffix}", source) == ("words",)
+        np.testing.assert_array_equal(
+            read_surface(tmp_path / f"a{suffix}").data["Gaussian curvature"], np.zeros(6)
+        )
+    said = write_moved(tmp_path / "a.obj", source)
+    assert said == ("error", "source_x", "Gaussian_curvature", "source_9", "words")
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+def test_texture_coordinates_come_through(tmp_path, suffix):
+    texture = np.arange(18.0).reshape(3, 3, 2) / 18
+    texture[0, 0] = texture[2, 2]
+    source = Surface(VERTICES, FACES, texture=texture)
+    assert write_moved(tmp_path / f"a{suffix}", source) == ()
+    found = read_surface(tmp_path / f"a{suffix}")
+    assert_same(found, source)
+    np.testing.assert_array_equal(found.texture, texture)
+    assert write_moved(tmp_path / "a.off", source) == ("texture coordinates",)
+
+
+def test_textures_of_obj_files(tmp_path):
+    """Vertices with several texture coordinates, quads, and faces that lack them."""
+    text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvt .5 .5\n"
+    faces = "f 1/1 2/2 3/3 4/-2\nf 1/5/1 2/2/1 5/1/1\n"
+    (tmp_path / "a.obj").write_text(text + faces)
+    found = read_surface(tmp_path / "a.obj")
+    assert found.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 4]]
+    expected = [[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]], [[0.5, 0.5], [1, 0], [0, 0]]]
+    np.testing.assert_array_equal(found.texture, expected)
+    (tmp_path / "a.obj").write_text(f"{text}{faces}f 3 4 5\n")
+    found = read_surface(tmp_path / "a.obj")
+    assert found.texture is None
+    assert found.left_out == ("texture coordinates",)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".glb"])
+def test_digits_of_large_coordinates(tmp_path, suffix):
+    """A small object at coordinates of a map; what is lost is at most half a float32 step."""
+    away = VERTICES[[3, 1, 2, 0, 4, 5]] * 1e-3 + [500_000, 4_000_000, 100]
+    away[3] = away[0] + 1e-3
+    (said,) = write_moved(tmp_path / f"a{suffix}", Surface(away, FACES))[-1:]
+    assert re.search(r"coordinates this large \(it rounds them by up to 0\.\d", said)
+    lost = np.abs(read_surface(tmp_path / f"a{suffix}").vertices.max(axis=0) - away.max(axis=0))
+    assert 1e-4 < lost.max() <= 0.25
+    near = write_moved(tmp_path / f"b{suffix}", Surface(away - away.mean(axis=0), FACES))
+    assert not any("coordinates" in said for said in near)
 
 
 def test_array_files_hold_everything(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 import yaml
 from click.testing import CliRunner
-from test_workflow import copy_workflow, planned, snakemake
+from test_workflow import ROOT, copy_workflow, planned, snakemake
 
 from dine.cli import cli
 from dine.data.pairs import read_pairs
@@ -86,3 +86,15 @@ def test_the_workflow_takes_any_name(name, tmp_path):
     made = folder / changes["results"] / "synbench" / "pairs.h5"
     snakemake(folder, made.relative_to(folder), *arguments)
     assert len(read_pairs(made)) == 3
+
+
+def test_the_workflow_starts_from_any_folder(tmp_path):
+    """Its own configuration is the base there, unless the folder has one of its own."""
+    where = tmp_path / "elsewhere"
+    where.mkdir()
+    arguments = ["-s", ROOT / "Snakefile", "--configfile", ROOT / "config" / "tiny.yaml"]
+    elsewhere = planned(where, *arguments)
+    assert elsewhere == planned(copy_workflow(tmp_path), *arguments[2:])
+    own = yaml.safe_load((ROOT / "config.yaml").read_text()) | {"results": "mine"}
+    (where / "config.yaml").write_text(yaml.safe_dump(own))
+    assert "mine/report.html" in snakemake(where, "-n", *arguments[:2]).stdout

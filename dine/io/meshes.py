@@ -1,0 +1,342 @@
+"""Reading OBJ, OFF and STL, and through trimesh the formats that pack scenes, such as glTF."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from dine.errors import DataError
+from dine.geometry.surface import Surface
+from dine.io import announced, polygons, text
+
+
+def nothing_in(path: Path) -> DataError:
+    """The error for a file without vertices."""
+    return DataError(
+        f"{path} holds no mesh and no points, or is cut short; expected a "
+        f"{text.format_suffix(path)} file with vertices, so export it again."
+    )
+
+
+def colors_of(values: np.ndarray) -> np.ndarray | None:
+    """Vertex colours (V, 3) or (V, 4) as uint8, of numbers up to 1 or 255; None of others."""
+    if values.ndim != 2 or values.shape[1] not in (3, 4) or not np.isfinite(values).all():
+        return None
+    if values.min(initial=0) < 0 or values.max(initial=0) > 255:
+        return None
+    scale = 255 if values.max(initial=0) <= 1 and values.dtype.kind == "f" else 1
+    return np.rint(values * scale).astype(np.uint8)
+
+
+# --- OBJ --------------------------------------------------------------------------------------
+
+# Other lines of an OBJ file: what is said of them where they are left out, or None for nothing.
+_OBJ_LINES = dict.fromkeys(("", "o", "g", "s", "mg", "vp", "deg", "bmat", "step", "cstype"))
+_OBJ_LINES |= dict.fromkeys(("parm", "trim", "hole", "scrv", "sp", "end", "con", "bevel", "lod"))
+_OBJ_LINES |= dict.fromkeys(("c_interp", "d_interp", "shadow_obj", "trace_obj", "ctech", "stech"))
+_OBJ_LINES |= {"vn": "normals", "l": "lines", "p": "points of faces"}
+_OBJ_LINES |= dict.fromkeys(("usemtl", "mtllib", "usemap", "maplib"), "materials")
+_OBJ_LINES |= dict.fromkeys(("curv", "curv2", "surf"), "curved surfaces")
+
+
+class _Obj:
+    """Lines of an OBJ file, taken one by one."""
+
+    def __init__(self):
+        self.vertices: list[list[str]] = []
+        self.coordinates: list[tuple[float, float]] = []
+        self.faces: list[tuple[int, ...]] = []
+        self.texture: list[tuple[int, ...]] = []
+        self.left_out: dict[str, None] = {}
+
+    def take(self, line: str) -> None:
+        keyword, *values = line.partition("#")[0].split() or [""]
+        keyword = keyword.lower()
+        if keyword == "v":
+            self.vertices.append(values)
+        elif keyword in ("f", "fo"):
+            self._face(values)
+        elif keyword == "vt":
+            self.coordinates.append((float(values[0]), float([*values, "0"][1])))
+        elif keyword in _OBJ_LINES:
+            if _OBJ_LINES[keyword]:
+                self.left_out[_OBJ_LINES[keyword]] = None
+        elif keyword.isascii() and keyword.isidentifier():
+            self.left_out[f"lines '{keyword}'"] = None
+        else:
+            raise ValueError(f"a line begins with {keyword!r}")
+
+    def _face(self, values: list[str]) -> None:
+        if len(values) < 3:
+            if len(values) < 2 or not all(value.lstrip("-").isdigit() for value in values):
+                raise ValueError("a face has fewer than 3 corners")
+            self.left_out["edges"] = None
+            return
+        parts = [value.split("/") for value in values]
+        corners = [_from_one(part[0], len(self.vertices)) for part in parts]
+        textured = all(len(part) > 1 and part[1] for part in parts)
+        places = [_from_one(part[1], len(self.coordinates)) if textured else -1 for part in parts]
+        for kept, (first, *others) in ((self.faces, corners), (self.texture, places)):
+            kept += [(first, *edge) for edge in itertools.pairwise(others)]
+
+    def data(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Vertices (V, 3) and their colours, which follow the coordinates."""
+        width = min(map(len, self.vertices))
+        if width < 3:
+            raise ValueError("a vertex has fewer than 3 coordinates")
+        table = np.array([row[:7] if width > 5 else row[:3] for row in self.vertices], np.float64)
+        colors = colors_of(table[:, 3:]) if width > 5 else None
+        if colors is None and any(len(row) > 4 for row in self.vertices):
+            self.left_out["colors"] = None
+        return table[:, :3], {} if colors is None else {"colors": colors}
+
+    def textured(self) -> np.ndarray | None:
+        """Texture coordinates (F, 3, 2), if all faces have them."""
+        places = np.array(self.texture, dtype=np.int64)
+        if len(places) and places.min() >= 0 and places.max() < len(self.coordinates):
+            return np.array(self.coordinates)[places]
+        if self.coordinates:
+            self.left_out["texture coordinates"] = None
+        return None
+
+
+def _from_one(index: str, count: int) -> int:
+    """Positive indices count from 1, negative ones back from the latest."""
+    number = int(index)
+    return number - 1 if number > 0 else count + number
+
+
+def read_obj(path: Path, data: bytes) -> Surface:
+    """A mesh or cloud; trimesh would split vertices along textures and materials."""
+    found = _Obj()
+    for line in re.sub(r"\\\r?\n", " ", data.decode("utf-8", "replace")).splitlines():
+        found.take(line)
+    if not found.vertices:
+        raise nothing_in(path)
+    vertices, values = found.data()
+    faces = np.array(found.faces) if found.faces else None
+    if faces is None and "curved surfaces" in found.left_out:
+        raise DataError(f"{path} holds curved surfaces only; export it as triangles.")
+    texture, space = found.textured(), text.stated_space(data)
+    return Surface(vertices, faces, str(path), values, texture, space, tuple(found.left_out))
+
+
+# --- OFF --------------------------------------------------------------------------------------
+
+
+def read_off(path: Path, data: bytes) -> Surface:
+    """A mesh or cloud of Geomview's OFF, COFF, NOFF and STOFF, as text."""
+    rows = [row.split() for row in text.rows(data)]
+    kind = re.fullmatch(rb"(ST)?(C)?(N)?OFF", rows[0][0] if rows else b"")
+    if kind is None:
+        raise ValueError("its first word is not OFF, COFF, NOFF or STOFF")
+    counts = rows.pop(0)[1:] or rows.pop(0)
+    vertices, faces = int(counts[0]), int(counts[1])
+    if min(vertices, faces) < 0 or len(rows) < vertices + faces:
+        raise DataError(f"{path} is cut short: it has fewer rows than it announces; copy it again.")
+    if vertices == 0:
+        raise nothing_in(path)
+    if len({len(row) for row in rows[:vertices]}) > 1:
+        raise ValueError("its vertices have different numbers of columns")
+    table = np.array(rows[:vertices], dtype=np.float64)
+    values, left_out = {}, ["normals"] if kind[3] else []
+    more = table[:, 6 if kind[3] else 3 :]
+    if kind[1]:
+        more, values["texture_coordinates"] = more[:, :-2], more[:, -2:]
+    colors = colors_of(more)
+    if colors is not None:
+        values["colors"] = colors
+    elif more.shape[1]:
+        left_out.append("further columns of vertices")
+    corners, ends, colored = [], [], False
+    for row in rows[vertices : vertices + faces]:
+        size = int(row[0])
+        if size < 0 or len(row) < 1 + size:
+            raise DataError(f"{path} is cut short: a face lacks corners; copy it again.")
+        corners += row[1 : 1 + size]
+        ends.append(len(corners))
+        colored |= len(row) > 1 + size
+    text.refuse_more(map(b" ".join, rows[vertices + faces :]), "faces")
+    left_out += ["colors of faces"] * colored
+    if polygons.small(np.array(ends, dtype=np.int64)):
+        left_out.append("edges")
+    triangles = polygons.fans(np.array(ends, dtype=np.int64))
+    cells = np.array([int(corner) for corner in corners], dtype=np.int64)
+    found = cells[triangles] if len(triangles) else None
+    return Surface(table[:, :3], found, str(path), values, left_out=tuple(left_out))
+
+
+# --- STL --------------------------------------------------------------------------------------
+
+#: One triangle of a binary file.
+FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_HEADER = 84
+
+
+def read_stl(path: Path, data: bytes) -> Surface:
+    """A mesh of three vertices for each triangle, of all solids in the file, text or binary."""
+    count = int.from_bytes(data[80:_HEADER], "little")
+    rest = len(data) - _HEADER - count * FACET.itemsize
+    plain = text.without_mark(data).lstrip()
+    # The header of a binary file may say "solid" as well; no text has zeros.
+    if rest != 0 and plain[:5].lower() == b"solid" and b"\0" not in plain[:_HEADER]:
+        corners, left_out = _text_stl(path, plain), []
+    else:
+        if rest < 0:
+            raise DataError(
+                f"{path} is cut short: it holds less than its header announces; copy it again."
+            )
+        if rest >= FACET.itemsize and data[-rest:].strip(b"\0\r\n "):
+            raise ValueError(f"it goes on after the {count} triangles that it announces")
+        facets = np.frombuffer(data, FACET, count, _HEADER)
+        corners = facets["corners"].reshape(-1, 3).astype(np.float64)
+        left_out = ["attributes of faces"] if facets["attribute"].any() else []
+    if len(corners) == 0:
+        raise nothing_in(path)
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    return Surface(corners, faces, str(path), {}, None, text.stated_space(data), tuple(left_out))
+
+
+def _text_stl(path: Path, data: bytes) -> np.ndarray:
+    """Corners (3 F, 3) of all solids; what stands between them is left out."""
+    corners: list[list[bytes]] = []
+    solid, facets = False, 0
+    for line in data.splitlines():
+        word, *values = line.split() or [b""]
+        word = word.lower()
+        if word == b"vertex" and solid:
+            corners.append(values[:3])
+        elif word in (b"solid", b"endsolid"):
+            solid = word == b"solid"
+        elif word == b"endfacet":
+            facets += 1
+            if len(corners) != 3 * facets:
+                raise ValueError("a facet has not 3 vertices")
+        elif solid and word not in (b"", b"facet", b"outer", b"endloop", b"color"):
+            raise ValueError(f"a line begins with {word.decode('utf-8', 'replace')!r}")
+    if solid or len(corners) != 3 * facets:
+        raise DataError(f"{path} is cut short: its last solid does not end; copy it again.")
+    return np.array(corners, dtype=np.float64).reshape(-1, 3)
+
+
+# --- through trimesh --------------------------------------------------------------------------
+
+
+def read_scene(path: Path, data: bytes) -> Surface:
+    """What trimesh reads: the meshes and clouds of a scene, one after another."""
+    suffix, lines = text.format_suffix(path), False
+    if suffix in (".gltf", ".glb"):
+        lines = _check_gltf(path, data)
+    loaded = trimesh.load(
+        io.BytesIO(data),
+        file_type=suffix[1:],
+        resolver=_Beside(path),
+        process=False,
+        maintain_order=True,
+        skip_materials=True,
+        fix_texture=False,  # would split vertices along texture seams
+    )
+    parts = _parts(path, loaded, len(data))
+    vertices, faces, count = [], [], 0
+    for part in parts:
+        vertices.append(np.asarray(part.vertices, dtype=np.float64))
+        if len(getattr(part, "faces", ())):
+            faces.append(np.asarray(part.faces, dtype=np.int64) + count)
+        count += len(part.vertices)
+    if count == 0:
+        raise nothing_in(path)
+    colors = [_vertex_colors(part) for part in parts]
+    known = all(values is not None for values in colors)
+    left_out = ["colors"] if not known and any(values is not None for values in colors) else []
+    if any(getattr(getattr(part, "visual", None), "uv", None) is not None for part in parts):
+        left_out.append("texture coordinates")
+    left_out += ["lines"] * lines
+    return Surface(
+        np.concatenate(vertices),
+        np.concatenate(faces) if faces else None,
+        str(path),
+        {"colors": np.concatenate(colors)} if known else {},
+        left_out=tuple(left_out),
+    )
+
+
+def _vertex_colors(part: trimesh.parent.Geometry) -> np.ndarray | None:
+    """(V, 4) uint8 of a mesh or cloud that has colours of its own."""
+    if isinstance(part, trimesh.PointCloud):
+        colors = part.colors
+    else:
+        colors = part.visual.vertex_colors if part.visual.kind == "vertex" else None
+    fits = colors is not None and np.shape(colors) == (len(part.vertices), 4)
+    return np.asarray(colors, dtype=np.uint8) if fits else None
+
+
+class _Beside(trimesh.resolvers.Resolver):
+    """Files that a mesh file names, such as the buffers of a glTF, from its own folder only."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def get(self, name: str) -> bytes:
+        folder = self.path.parent.resolve()
+        found = (folder / name).resolve()
+        if not found.is_relative_to(folder) or not found.is_file():
+            raise DataError(
+                f"{self.path} names the file {name!r}, which is not in its folder; export the mesh "
+                "as a single file."
+            )
+        return found.read_bytes()
+
+    def write(self, name: str, data: str | bytes) -> None:
+        raise NotImplementedError("reading writes nothing")
+
+    def keys(self) -> list[str]:
+        return [entry.name for entry in self.path.parent.iterdir()]
+
+    def namespaced(self, namespace: str) -> _Beside:
+        return _Beside(self.path.parent / namespace / self.path.name)
+
+
+def _check_gltf(path: Path, data: bytes) -> bool:
+    """Refuse what trimesh leaves out or puts zeros in the place of; tell of lines."""
+    if text.format_suffix(path) == ".glb":
+        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    content = json.loads(data)
+    for accessor in content.get("accessors", ()):
+        if "bufferView" not in accessor or "sparse" in accessor:
+            raise DataError(
+                f"{path} holds compressed or sparse arrays, which are not read; export it without "
+                "compression."
+            )
+    parts = (part for mesh in content.get("meshes", ()) for part in mesh.get("primitives", ()))
+    modes = {part.get("mode", 4) for part in parts}
+    if 6 in modes:
+        raise DataError(
+            f"{path} holds fans of triangles, which are not read; export it as triangles."
+        )
+    return bool(modes & {1, 2, 3})
+
+
+def _parts(
+    path: Path, loaded: trimesh.parent.Geometry, stored: int
+) -> list[trimesh.parent.Geometry]:
+    """The meshes and clouds of a file, placed as its scene says, in the order of the file."""
+    if not isinstance(loaded, trimesh.Scene):
+        found = [loaded]
+    else:
+        # The scene graph lists its nodes in an order of its own; geometries keep the file's.
+        order = {name: rank for rank, name in enumerate(loaded.geometry)}
+        placed = [(loaded.graph[node], node) for node in loaded.graph.nodes_geometry]
+        placed.sort(key=lambda item: (order[item[0][1]], str(item[1])))
+        # A mesh that is placed many times is copied as often.
+        size = sum(loaded.geometry[name].vertices.nbytes for (_, name), _ in placed)
+        announced.check(path, "its scene", size, announced.limit(stored))
+        found = [loaded.geometry[name].copy() for (_, name), _ in placed]
+        for part, ((transform, _), _) in zip(found, placed, strict=True):
+            part.apply_transform(transform)
+    return [part for part in found if isinstance(part, trimesh.Trimesh | trimesh.PointCloud)]
