@@ -1,6 +1,6 @@
 """Errors of registrations of two scans that share nothing: one row a condition.
 
-    python benchmarks/surfaces.py ../shared/meshes [--surfaces] [--half tuned] [--only remeshed]
+    python benchmarks/surfaces.py ../shared/meshes [--points] [--half tuned] [--only remeshed]
 
 Every mesh of ``objects`` is registered to a copy that the published recipe deforms (a synthetic
 deformation of a real shape) and whose mesh is simplified to 55 % of its faces, so that the two
@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("meshes", type=Path)
     parser.add_argument("--half", choices=["tuned", "kept"], help="of the objects")
     parser.add_argument("--only", nargs="+", help="words in the conditions wanted")
-    parser.add_argument("--surfaces", action="store_true", help="go on to the surfaces")
+    parser.add_argument("--points", action="store_true", help="do not go on to the surfaces")
     parser.add_argument("--each", action="store_true", help="a line for every object, too")
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
@@ -145,7 +145,7 @@ def main() -> None:
         rows = []
         for name, source, target, truth in pairs:
             began = time.process_time()
-            result = register(source, target, model=model, surfaces=arguments.surfaces)
+            result = register(source, target, model=model, surfaces=not arguments.points)
             seconds = time.process_time() - began
             unit = radius(source) / 100
             places = (

@@ -242,7 +242,8 @@ def register_many(manifest, out, suffix, settings, view, load_model):
 def calibrate(model, pairs, targets, raws, prior, compute, out):
     """Learn from validation pairs what a model's uncertainty means; check it on test pairs.
 
-    With --raw for `register --surfaces`, on the meshes that the pairs were drawn on.
+    With --raw on the meshes that the pairs were drawn on, as `register` goes; otherwise for
+    `register --no-surfaces`.
 
     Example: dine calibrate --model model.safetensors --pairs pairs.h5 --targets resampled.h5
     --raw raw.json --prior pca.safetensors --out calibration.json

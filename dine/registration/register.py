@@ -46,7 +46,7 @@ def register(
     apply: Mapping[str, Shape] | None = None,
     landmarks: tuple[Points, Points] | None = None,
     rounds: int = ROUNDS,
-    surfaces: bool = False,
+    surfaces: bool = True,
     partial: bool = False,
     points: int = POINTS,
     seed: int = 0,
@@ -69,7 +69,7 @@ def register(
             with only.
         rounds: of refinement at test time (most probable smooth field); 0 for the network's own.
         surfaces: go on from the points to the surfaces that they were drawn on (meshes), or to all
-            points (clouds); not without rounds. On trial, see docs/guide/register.md.
+            points (clouds); not without rounds.
         partial: the target shows a part of the source only. Regions without counterpart follow the
             others instead of being pulled onto the part.
         points: points that the network sees; it was trained with 1024.

@@ -52,7 +52,7 @@ class Settings:
     points: int
     seed: int
     device: torch.device
-    surfaces: bool = False
+    surfaces: bool = True
 
     def described(self, points: int) -> dict[str, Any]:
         """For the report; ``points`` were drawn."""

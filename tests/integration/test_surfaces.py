@@ -57,8 +57,8 @@ def test_normals_of_a_mesh_point_out_of_it():
 
 def test_the_surface_says_more_than_its_points(pair):
     source, target, truth = pair
-    coarse = dine.register(source, target, prealign="off")
-    fine = dine.register(source, target, prealign="off", surfaces=True)
+    coarse = dine.register(source, target, prealign="off", surfaces=False)
+    fine = dine.register(source, target, prealign="off")
     assert mean_error(fine.moved.vertices, truth) < 0.02
     assert mean_error(fine.moved.vertices, truth) < 0.5 * mean_error(coarse.moved.vertices, truth)
     used = [result.report["settings"]["surfaces"] for result in (fine, coarse)]
@@ -67,7 +67,7 @@ def test_the_surface_says_more_than_its_points(pair):
 
 def test_a_mesh_registered_to_itself_stays_where_it_is():
     source = organ()
-    result = dine.register(source, source, surfaces=True)
+    result = dine.register(source, source)
     assert result.report["trust"]["checks"]["remaining"] == 0
     assert np.linalg.norm(result.displacement, axis=1).mean() < 1e-3
 
@@ -76,7 +76,7 @@ def test_clouds_use_all_their_points(pair):
     source, target, truth = pair
     rng = np.random.default_rng(0)
     drawn = sample_surface(target, 6000, rng).places(target.vertices)
-    result = dine.register(source.vertices, drawn, prealign="off", surfaces=True)
+    result = dine.register(source.vertices, drawn, prealign="off")
     assert mean_error(result.moved.vertices, truth) < 0.03
 
 
@@ -84,8 +84,8 @@ def test_a_part_of_the_target_pulls_at_what_it_shows_only(pair):
     source, target, truth = pair
     shown = target.vertices[target.vertices[:, 0] > -0.1]
     settings = {"prealign": "off", "partial": True}
-    coarse = dine.register(source, shown, **settings)
-    fine = dine.register(source, shown, **settings, surfaces=True)
+    coarse = dine.register(source, shown, **settings, surfaces=False)
+    fine = dine.register(source, shown, **settings)
     assert mean_error(fine.moved.vertices, truth) < mean_error(coarse.moved.vertices, truth)
 
 
@@ -94,16 +94,40 @@ def test_scans_that_share_their_points_are_matched_exactly():
     source = sample_surface(organ(), 500, rng).places(organ().vertices)
     truth = bent(source)
     shuffled = truth[rng.permutation(500)]
-    result = dine.register(source, shuffled, prealign="off", surfaces=True)
+    result = dine.register(source, shuffled, prealign="off")
     assert mean_error(result.moved.vertices, truth) < 1e-3
 
 
-def test_the_command_goes_on_to_the_surfaces_where_asked(pair, tmp_path):
+def test_the_command_goes_on_to_the_surfaces_unless_told_not_to(pair, tmp_path):
     for name, surface in zip(("before", "after"), pair, strict=False):
         write_surface(tmp_path / f"{name}.ply", surface)
     out = tmp_path / "moved.ply"
     files = (tmp_path / "before.ply", tmp_path / "after.ply")
-    done = CliRunner().invoke(cli, ["register", *map(str, files), "-o", str(out), "--surfaces"])
-    assert done.exit_code == 0, done.exception
-    assert read_json(out.with_suffix(".json"))["settings"]["surfaces"]
-    assert mean_error(read_surface(out).vertices, pair[2]) < 0.02
+    error = {}
+    for more in ([], ["--no-surfaces"]):
+        command = ["register", *map(str, files), "-o", str(out), "--overwrite", *more]
+        done = CliRunner().invoke(cli, command)
+        assert done.exit_code == 0, done.exception
+        used = read_json(out.with_suffix(".json"))["settings"]["surfaces"]
+        error[used] = mean_error(read_surface(out).vertices, pair[2])
+    assert error[True] < 0.02 < error[False]
+
+
+def test_an_open_sheet_does_not_shrink_to_be_rid_of_its_rim():
+    """Nearly flat, so that it might slide anywhere; its rim says where it belongs."""
+    x, y = (
+        grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-0.7, 0.7, 29))
+    )
+    corner = np.arange(40 * 28) % 40 + 41 * (np.arange(40 * 28) // 40)
+    faces = np.concatenate([corner[:, None] + [0, 1, 42], corner[:, None] + [0, 42, 41]])
+    sheet = Surface(np.column_stack([x, y, 0.1 * (x**2 - y**2)]), faces)
+    truth = sheet.vertices + 0.05 * np.column_stack([np.sin(y), np.zeros_like(x), np.cos(2 * x)])
+    # Other triangles of the same surface.
+    middles = truth[faces].mean(axis=1)
+    split = np.concatenate(
+        [np.column_stack([faces[:, [i, (i + 1) % 3]], len(truth) + np.arange(len(faces))])
+         for i in range(3)]
+    )  # fmt: skip
+    target = Surface(np.concatenate([truth, middles]), split)
+    result = dine.register(sheet, target, prealign="off")
+    assert mean_error(result.moved.vertices, truth) < 0.015

@@ -9,7 +9,8 @@ from dine.geometry.oriented import (
     OrientedPoints,
     evenly,
     fitted_planes,
-    rim_vertices,
+    rim_curve,
+    rim_edges,
     unit,
 )
 
@@ -78,13 +79,27 @@ def test_a_thin_wall_has_two_sides():
 def test_the_rim_is_where_faces_end():
     # A square of two triangles beside a third one that shares an edge with it.
     faces = np.array([[0, 1, 2], [0, 2, 3], [2, 1, 4]])
-    assert rim_vertices(faces, 6).tolist() == [True] * 5 + [False]
+    edges = rim_edges(faces, 6).tolist()
+    assert edges == [[0, 1], [0, 3], [1, 4], [2, 3], [2, 4]]
     closed = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
-    assert not rim_vertices(closed, 4).any()
-    # Only the vertices around a missing face of a larger mesh are on its rim.
+    assert not len(rim_edges(closed, 4))
+    # Only the edges around a missing face of a larger mesh are its rim.
     ball = trimesh.creation.icosphere(subdivisions=2)
-    rim = rim_vertices(np.asarray(ball.faces)[1:], len(ball.vertices))
-    assert sorted(np.flatnonzero(rim)) == sorted(ball.faces[0])
+    rim = rim_edges(np.asarray(ball.faces)[1:], len(ball.vertices))
+    assert sorted(set(rim.ravel())) == sorted(ball.faces[0])
+
+
+def test_points_of_a_rim_lie_on_it_at_equal_distances():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 2, 0], [0, 2, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    rim = rim_curve(corners, rim_edges(faces, 4), 0.1)
+    assert len(rim.points) == 60
+    outside = np.abs(rim.points[:, :2] - [0.5, 1]) - [0.5, 1]
+    assert np.allclose(outside.max(axis=1), 0)
+    assert np.allclose(np.abs(rim.tangents).max(axis=1), 1)
+    # Nothing of what is closed.
+    closed = rim_curve(corners, rim_edges(faces[:0], 4), 0.1)
+    assert closed.points.shape == closed.tangents.shape == (0, 3)
 
 
 def test_planes_say_how_rough_a_cloud_is(sphere):

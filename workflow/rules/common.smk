@@ -130,8 +130,13 @@ def method_options(name, input):
 
 
 def calibration_options(input):
-    """Of `dine calibrate`: pairs, their targets of other points, and a prior if there is one."""
-    named = (("--pairs", input.pairs), ("--targets", input.targets))
+    """Of `dine calibrate`: pairs, their targets of other points, the meshes that both were drawn
+    on, and a prior if there is one."""
+    named = (
+        ("--pairs", input.pairs),
+        ("--targets", input.targets),
+        ("--raw", input.raws),
+    )
     return " ".join(options(*x) for x in (*named, ("--prior", input.priors)))
 
 

@@ -142,6 +142,7 @@ use rule calibrate as pretraining_calibration with:
         model=PRETRAINED.model,
         pairs=[data.pairs for data in SHAPES_DATA],
         targets=[data.resampled for data in SHAPES_DATA],
+        raws=[data.raw for data in SHAPES_DATA],
         priors=[PRETRAINED.prior],
     output:
         calibration=PRETRAINED.calibration,

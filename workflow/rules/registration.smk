@@ -21,6 +21,7 @@ rule calibrate:
         model=NETWORK.model,
         pairs=[DATA.pairs],
         targets=[DATA.resampled],
+        raws=lambda wildcards: [*PLAN.raw_files(wildcards.dataset).values()],
         priors=lambda wildcards: PLAN.calibrating_files(
             wildcards.dataset, wildcards.backbone
         ),
