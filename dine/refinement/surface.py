@@ -67,10 +67,12 @@ class SurfaceOptions:
 
 
 DEFAULTS = SurfaceOptions()
-# Points of the source, of the target, and of the latter those that look for the source, and columns
-# of the prior's kernel, while several fields are tried, and how many look where one is.
-_FEWER = 1000, 5000, 2000, 150
+# While several fields are tried: points of the source, of the target and of those that look for the
+# source, columns of the prior's kernel. Of the one that goes on so many look.
+_FEWER_POINTS, _FEWER_TARGETS, _FEWER_LOOKING, _FEWER_COLUMNS = 1000, 5000, 2000, 150
 _LOOKING = 8000
+# Mean distance of fields that are the same.
+_AGREED = 0.01
 # Share of the clear matches whose normals agree from which signs are known.
 _ONE_SIDED = 0.9
 
@@ -101,8 +103,8 @@ def refine_on_surface(
 ) -> Posterior:
     """The field after some rounds, as the posterior of the last one.
 
-    Fields are found from every start, and with every first standard deviation, on fewer points; the
-    most probable of them goes on on all. Where the matches are more probable if nothing but the
+    Fields are found from every start, and with every first standard deviation until all starts lead
+    to the same, on fewer points; the most probable of them goes on on all. Where the matches are more probable if nothing but the
     prior's mean happened, that is kept: what is left then follows from where points happened to be
     drawn.
 
@@ -140,15 +142,14 @@ def _fields(
     between: float,
 ) -> Iterator[tuple[np.ndarray, float]]:
     """Fields (N + E, 3) down to some standard deviation, on fewer points, and their energies."""
-    points, fixed, looking, rank = _FEWER
-    count = len(source.surface.points)
-    inside = evenly(source.surface.points, points)
+    rank, count = _FEWER_COLUMNS, len(source.surface.points)
+    inside = evenly(source.surface.points, _FEWER_POINTS)
     rim = np.arange(0, len(source.rim.points), 2)
     few = _Search(
         Outline(source.surface.at(inside), source.rim.at(rim)),
-        Outline(target.surface.at(spread(len(target.surface.points), fixed)), target.rim),
+        Outline(target.surface.at(spread(len(target.surface.points), _FEWER_TARGETS)), target.rim),
         search.options,
-        looking,
+        _FEWER_LOOKING,
     )
     few.signs = search.signs
     rows = np.concatenate([inside, count + rim])
@@ -156,11 +157,16 @@ def _fields(
     less = LinearGaussian(prior.mean[rows], prior.modes[:, rows], prior.kernel[rows, :rank])
     for first in search.options.firsts:
         schedule = np.geomspace(max(first, between), between, search.options.rounds)
+        ends = []
         for start in starts:
             found = few.posterior(start[rows], less, schedule)
             field = prior.mean + prior.kernel[:, :rank] @ found.alone
             field += np.tensordot(found.shared, prior.modes, axes=1)
+            ends.append(field)
             yield field, found.energy
+        apart = np.ptp(ends, axis=0)
+        if len(ends) > 1 and np.linalg.norm(apart, axis=1).mean() < _AGREED:
+            return
 
 
 def spread(count: int, some: int) -> np.ndarray:
