@@ -104,9 +104,9 @@ def refine_on_surface(
     """The field after some rounds, as the posterior of the last one.
 
     Fields are found from every start, and with every first standard deviation until all starts lead
-    to the same, on fewer points; the most probable of them goes on on all. Where the matches are more probable if nothing but the
-    prior's mean happened, that is kept: what is left then follows from where points happened to be
-    drawn.
+    to the same, on fewer points; the most probable of them goes on on all. Where the matches are
+    more probable if nothing but the prior's mean happened, that is kept: what is left then follows
+    from where points happened to be drawn.
 
     Args:
         source: points spread evenly.
