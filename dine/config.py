@@ -816,7 +816,10 @@ def validate(values: Any, where: str = "the configuration") -> Config:
             gone["methods"] = {name for name, entry in methods.items() if entry is None}
         values = {key: _without_null(key, section) for key, section in values.items()}
         _forget(values.get("evidence"), gone)
-        _forget_backbones(values, gone)
+        if isinstance(values.get("backbones"), dict):
+            # A prior that a backbone names must be there.
+            lost = {"datasets": gone.get("datasets", set())}
+            values["backbones"] = _left(values["backbones"], lost)
     return validate_section(Config, values, where)
 
 
@@ -835,22 +838,6 @@ def _only(methods: dict[str, Any], kept: list[Any]) -> dict[str, Any]:
     return {name: entry if name in kept else None for name, entry in methods.items()}
 
 
-def _forget_backbones(values: dict[str, Any], gone: dict[str, set[str]]) -> None:
-    """Take away the backbones whose datasets were all taken away, and these from the others."""
-    backbones, lost = values.get("backbones"), gone.get("datasets")
-    if not isinstance(backbones, dict) or not lost:
-        return
-    kept = {}
-    for name, entry in backbones.items():
-        if isinstance(entry, dict) and isinstance(entry.get("datasets"), list):
-            left = [dataset for dataset in entry["datasets"] if not _is_gone(dataset, lost)]
-            if entry["datasets"] and not left:
-                continue
-            entry = {**entry, "datasets": left}
-        kept[name] = entry
-    values["backbones"] = kept
-
-
 def _without_null(key: str, section: Any) -> Any:
     if not isinstance(section, dict):
         return section
@@ -865,37 +852,33 @@ def _forget(evidence: Any, gone: dict[str, set[str]]) -> None:
     """Take away from the evidence what was taken away elsewhere, in place."""
     if not isinstance(evidence, dict):
         return
-    sets = evidence.get("test_sets")
-    if isinstance(sets, dict):
-        evidence["test_sets"] = {
-            name: entry
-            for name, entry in sets.items()
-            if not isinstance(entry, dict)
-            or not _is_gone(entry.get("networks"), gone.get("datasets", ()))
-        }
-    for section in ("backbones", "methods"):
+    for section in ("test_sets", "backbones", "methods"):
         entries = evidence.get(section)
-        if not isinstance(entries, dict):
-            continue
-        kept = {}
-        for name, entry in entries.items():
-            if isinstance(entry, dict):
-                entry = dict(entry)
-                if _is_gone(entry.get("prior"), gone.get("priors", ())):
-                    continue
-                lists = [key for key in NAMED if isinstance(entry.get(key), list)]
-                for key in lists:
-                    entry[key] = [x for x in entry[key] if not _is_gone(x, gone.get(key, ()))]
-                # Priors are what a backbone is tried with; without datasets nothing is left.
-                if any(not entry[key] for key in lists if key != "priors"):
-                    continue
-            kept[name] = entry
-        if section == "methods":
-            gone.setdefault(section, set()).update(entries.keys() - kept)
-        evidence[section] = kept
+        if isinstance(entries, dict):
+            evidence[section] = _left(entries, gone)
+            if section == "methods":
+                gone.setdefault(section, set()).update(entries.keys() - evidence[section])
     if isinstance(evidence.get("examples"), list):
         lost = gone.get("methods", set()) | gone.get("priors", set())
         evidence["examples"] = [x for x in evidence["examples"] if not _is_gone(x, lost)]
+
+
+def _left(entries: dict[str, Any], gone: dict[str, set[str]]) -> dict[str, Any]:
+    """The entries that do without what was taken away, and without its name."""
+    kept = {}
+    for name, entry in entries.items():
+        if isinstance(entry, dict):
+            needed = (("prior", "priors"), ("networks", "datasets"))
+            if any(_is_gone(entry.get(key), gone.get(section, ())) for key, section in needed):
+                continue
+            lists = {key: entry[key] for key in NAMED if isinstance(entry.get(key), list)}
+            less = {k: [x for x in v if not _is_gone(x, gone.get(k, ()))] for k, v in lists.items()}
+            # Priors are what a backbone is tried with; without datasets nothing is left.
+            if any(lists[key] and not less[key] for key in less if key != "priors"):
+                continue
+            entry = {**entry, **less}
+        kept[name] = entry
+    return kept
 
 
 def _is_gone(name: Any, gone: Collection[str]) -> bool:

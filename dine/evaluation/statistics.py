@@ -63,12 +63,17 @@ def rank_biserial(differences: np.ndarray) -> float:
     differences; zeros are left out, as in Wilcoxon's test, and 0 is returned where nothing remains.
     −1: all differences are negative. Kerby (2014), Comprehensive Psychology 3.
     """
-    differences = np.asarray(differences, dtype=float)
-    differences = differences[differences != 0]
+    differences, ranks = _ranked(differences)
     if len(differences) == 0:
         return 0.0
-    ranks = stats.rankdata(np.abs(differences))
     return float((np.sign(differences) * ranks).sum() / ranks.sum())
+
+
+def _ranked(differences: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The differences that are not zero, and the ranks of their sizes."""
+    differences = np.asarray(differences, dtype=float)
+    differences = differences[differences != 0]
+    return differences, stats.rankdata(np.abs(differences))
 
 
 def wilcoxon(differences: np.ndarray) -> float:
@@ -78,11 +83,9 @@ def wilcoxon(differences: np.ndarray) -> float:
     13 with), normal approximation corrected for ties otherwise. Wilcoxon (1945), Biometrics
     Bulletin 1.
     """
-    differences = np.asarray(differences, dtype=float)
-    differences = differences[differences != 0]
+    differences, ranks = _ranked(differences)
     if len(differences) == 0:
         return 1.0
-    ranks = stats.rankdata(np.abs(differences))
     if len(ranks) <= 13 and len(np.unique(ranks)) < len(ranks):
         return _over_all_signs(ranks, differences > 0)
     return float(stats.wilcoxon(differences).pvalue)

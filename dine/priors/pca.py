@@ -129,8 +129,7 @@ class PCAPrior(Prior):
 
     def projected(self, displacement: Tensor) -> Tensor:
         """The closest field of the span in standardised coordinates, (B, N, 3) to (B, N, 3)."""
-        latent = self.latent(displacement)
-        return (self.mean + self.scale * (latent @ self.basis)).view_as(displacement)
+        return self._field(self.latent(displacement) @ self.basis)
 
     def check_complete(self, mask: Tensor | None) -> None:
         """Refuse fields of which ``mask`` (B, N) leaves points out.
@@ -160,11 +159,21 @@ class PCAPrior(Prior):
         generator: torch.Generator | None = None,
         source: Tensor | None = None,
     ) -> Tensor:
-        noise = torch.randn(
-            count, self.shape["components"], generator=generator, dtype=self.mean.dtype
-        ).to(self.mean.device)
-        latent = noise @ torch.linalg.cholesky(self.covariance).T
-        return (self.mean + self.scale * (latent @ self.basis)).view(count, -1, 3)
+        latent = self._draw_latent(self._noise(count, self.shape["components"], generator))
+        return self._field(latent @ self.basis)
+
+    def _noise(self, count: int, width: int, generator: torch.Generator | None) -> Tensor:
+        """Standard normal numbers (count, width)."""
+        like = {"generator": generator, "dtype": self.mean.dtype}
+        return torch.randn(count, width, **like).to(self.mean.device)
+
+    def _draw_latent(self, noise: Tensor) -> Tensor:
+        """Latent coordinates from (count, n_c) standard normal numbers."""
+        return noise @ torch.linalg.cholesky(self.covariance).T
+
+    def _field(self, standardised: Tensor) -> Tensor:
+        """Fields (B, N, 3) from standardised coordinates (B, 3N)."""
+        return (self.mean + self.scale * standardised).view(len(standardised), -1, 3)
 
     def modes(self) -> np.ndarray:
         """Displacement per unit of each latent coordinate: (n_c, N, 3)."""

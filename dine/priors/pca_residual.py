@@ -142,19 +142,10 @@ class PCAResidualPrior(PCAPrior):
         generator: torch.Generator | None = None,
         source: Tensor | None = None,
     ) -> Tensor:
-        noise = torch.randn(
-            count, self.shape["components"], generator=generator, dtype=self.mean.dtype
-        ).to(self.mean.device)
-        field = torch.randn(count, len(self.mean), generator=generator, dtype=self.mean.dtype).to(
-            self.mean.device
-        )
-        latent = self._draw_latent(noise)
+        noise = self._noise(count, self.shape["components"], generator)
+        field = self._noise(count, len(self.mean), generator)
         residual = self.variance.sqrt() * (field - field @ self.basis.T @ self.basis)
-        return (self.mean + self.scale * (latent @ self.basis + residual)).view(count, -1, 3)
-
-    def _draw_latent(self, noise: Tensor) -> Tensor:
-        """Latent coordinates from (count, n_c) standard normal numbers."""
-        return noise @ torch.linalg.cholesky(self.covariance).T
+        return self._field(self._draw_latent(noise) @ self.basis + residual)
 
     def gaussian(self, source: np.ndarray) -> LinearGaussian:
         """As :meth:`PCAPrior.gaussian`: the span alone.
