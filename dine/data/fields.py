@@ -59,11 +59,19 @@ class TrainingFields:
 
 def put_fields(group: h5py.Group, pair: np.ndarray, displacement: np.ndarray) -> None:
     """Store (P, N, 3) fields in the normalised frame and the (P,) names of their pairs."""
-    data = group.create_dataset(
-        "displacement", data=displacement, chunks=(1, *displacement.shape[1:]), fletcher32=True
+    put_numbers(
+        group, "displacement", displacement, "(P, N, 3) predicted displacements, normalised frame"
     )
-    data.attrs["description"] = "(P, N, 3) predicted displacements, normalised frame"
     put_names(group, pair)
+
+
+def put_numbers(
+    group: h5py.Group, name: str, values: np.ndarray, description: str, *, by_row: bool = True
+) -> None:
+    """Store an array with a checksum for each of its rows, or for as much as HDF5 likes."""
+    chunks = (1, *values.shape[1:]) if by_row else None
+    data = group.create_dataset(name, data=values, chunks=chunks, fletcher32=True)
+    data.attrs["description"] = description
 
 
 def put_names(group: h5py.Group, pair: np.ndarray) -> None:
@@ -125,11 +133,7 @@ def write_training_fields(
         file.attrs.update(format=FIELDS_FORMAT, convention=fields.convention, **facts)
         put_fields(file, pair, fields.displacement)
         for name, what in zip(_TRAINING[1:], ("source points", "true displacements"), strict=True):
-            values = getattr(fields, name)
-            data = file.create_dataset(
-                name, data=values, chunks=(1, *values.shape[1:]), fletcher32=True
-            )
-            data.attrs["description"] = f"(K, N, 3) {what}, normalised frame"
+            put_numbers(file, name, getattr(fields, name), f"(K, N, 3) {what}, normalised frame")
 
 
 def read_fields(path: str | os.PathLike) -> TrainingFields:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from dine.data.fields import put_names
+from dine.data.fields import put_names, put_numbers
 from dine.data.pairs import PairSet, read_pairs, read_variant_subset
 from dine.errors import ConfigError, DataError
 from dine.evaluation.predictions import Prediction, read_predictions
@@ -211,10 +211,8 @@ def _write_point_errors(path: Path, errors: dict[str, tuple[np.ndarray, np.ndarr
         for key, (pair, values) in errors.items():
             group = file.create_group(key)
             put_names(group, pair)
-            data = group.create_dataset("squared_distance", data=values, fletcher32=True)
-            data.attrs["description"] = (
-                "(P, N) squared distance of each moved source point to the clean target"
-            )
+            text = "(P, N) squared distance of each moved source point to the clean target"
+            put_numbers(group, "squared_distance", values, text, by_row=False)
 
 
 def _require(

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from dine.data.fields import get_names, get_numbers, get_text, opened, put_fields
+from dine.data.fields import get_names, get_numbers, get_text, opened, put_fields, put_numbers
 from dine.results import CLEAN
 
 FORMAT = "dine-predictions"
@@ -42,20 +42,12 @@ def put_prediction(group: h5py.Group, prediction: Prediction) -> None:
     group.attrs.update(condition=prediction.condition, corruption=prediction.corruption)
     put_fields(group, prediction.pair, prediction.displacement)
     if prediction.spread is not None:
-        data = group.create_dataset(
-            "spread",
-            data=np.asarray(prediction.spread, np.float32),
-            chunks=(1, prediction.spread.shape[1]),
-            fletcher32=True,
-        )
-        data.attrs["description"] = (
-            "(P, N) standard deviation of each source point's marginal, normalised frame"
-        )
+        text = "(P, N) standard deviation of each source point's marginal, normalised frame"
+        put_numbers(group, "spread", np.asarray(prediction.spread, np.float32), text)
     if prediction.seconds is not None:
-        data = group.create_dataset(
-            "seconds", data=np.asarray(prediction.seconds, np.float64), fletcher32=True
-        )
-        data.attrs["description"] = "(P,) wall time of each pair in seconds"
+        seconds = np.asarray(prediction.seconds, np.float64)
+        text = "(P,) wall time of each pair in seconds"
+        put_numbers(group, "seconds", seconds, text, by_row=False)
 
 
 def read_predictions(path: Path) -> list[Prediction]:

@@ -278,14 +278,19 @@ def _with_value(both: pd.DataFrame, value: str) -> pd.DataFrame:
     return known[[*_GROUP, *_PAIR]].assign(method=ours, reference=theirs, difference=ours - theirs)
 
 
+def rounded(metrics: pd.DataFrame) -> pd.DataFrame:
+    """Levels and corruptions as keys that meet."""
+    keys = ("level", "corruption")
+    return metrics.assign(**{name: metrics[name].astype(float).round(_DECIMALS) for name in keys})
+
+
 def _tidy(metrics: pd.DataFrame, values: Iterable[str]) -> pd.DataFrame:
     """The columns needed, with keys that meet, or the reason why it cannot be."""
     values = list(dict.fromkeys(values))
     missing = [name for name in [*_NEEDED, *values] if name not in metrics]
     if missing:
         raise DataError(f"The metrics lack the column(s) {', '.join(missing)}.")
-    keys = {name: metrics[name].astype(float).round(_DECIMALS) for name in ("corruption", "level")}
-    rows = metrics[[*_NEEDED, *values]].assign(**keys)
+    rows = rounded(metrics[[*_NEEDED, *values]])
     repeated = rows[rows.duplicated([*_GROUP, "method", "seed", "pair"])]
     if len(repeated):
         row = repeated.iloc[0]

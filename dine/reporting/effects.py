@@ -14,9 +14,9 @@ from dine.config import CONTROL, STAGE1
 from dine.evaluation.statistics import verdicts
 from dine.reporting import names
 from dine.reporting.loading import origin_of
-from dine.reporting.names import DASH, change, display_name, rank
+from dine.reporting.names import DASH, change, display_name, in_order
 from dine.reporting.table import Cell, Table
-from dine.results import CLEAN, KNOWN, trained_on
+from dine.results import CLEAN, trained_on
 
 _KEYS = ["objects", "dataset", "backbone", "method"]
 
@@ -35,13 +35,7 @@ def effects(
     found = found[~found["method"].isin([STAGE1, CONTROL])]
     kinds = metrics.groupby("dataset")["objects"].first()
     found = found.assign(objects=found["dataset"].map(kinds))
-    orders = {"method": names.METHODS, "backbone": names.BACKBONES, "objects": [KNOWN]}
-    return found.sort_values(
-        ["objects", "method", "dataset", "backbone"],
-        key=lambda column: column.map(lambda x: rank(x, orders.get(column.name, ()))),
-        kind="stable",
-        ignore_index=True,
-    )
+    return in_order(found, ["objects", "method", "dataset", "backbone"])
 
 
 def headlines(control: pd.DataFrame, metrics: pd.DataFrame) -> list[str]:

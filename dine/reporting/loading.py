@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from dine.errors import DataError
+from dine.evaluation.statistics import rounded
 from dine.reporting import names
 from dine.results import UNSEEN, unseen_of
 
@@ -24,8 +25,6 @@ _ALLOWED = {
 _KEYS = ["dataset", "backbone", "method", "seed", "condition", "corruption", "pair"]
 # What evaluate may leave out: unknown level or correspondences, time that was not measured.
 _MAY_LACK = {"level", "seconds", "mce", "accuracy_2_5", "accuracy_5", "far_points"}
-# Levels and corruptions that passed through float32 must still meet; real ones lie far apart.
-_DECIMALS = 6
 
 
 def load_metrics(paths: Iterable[str | os.PathLike]) -> pd.DataFrame:
@@ -113,12 +112,6 @@ def _read_numbers(column: pd.Series, path: Path) -> pd.Series:
             f"{int(np.argmax(bad)) + 1}; it must be a finite number of at least 0."
         )
     return values
-
-
-def rounded(frame: pd.DataFrame) -> pd.DataFrame:
-    """Levels and corruptions as keys that meet."""
-    keys = ("level", "corruption")
-    return frame.assign(**{name: frame[name].astype(float).round(_DECIMALS) for name in keys})
 
 
 def origin_of(dataset: str, metrics: pd.DataFrame) -> str | None:

@@ -76,6 +76,23 @@ def rank(name: str, known: Iterable[str]) -> str:
     return f"{order.index(name) if name in order else len(order):03d} {name}"
 
 
+def in_order(frame: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
+    """Rows sorted by some columns, names as the paper has them."""
+    orders = {
+        "condition": CONDITIONS,
+        "backbone": ["", *BACKBONES],
+        "method": METHODS,
+        "objects": [KNOWN],
+        "dataset": [],
+    }
+
+    def ranks(column: pd.Series) -> pd.Series:
+        order = orders.get(column.name)
+        return column if order is None else column.map(lambda name: rank(name, order))
+
+    return frame.sort_values(keys, key=ranks, kind="stable", ignore_index=True)
+
+
 def slug(*names: str) -> str:
     """A name for a file from names that may hold anything."""
     return "_".join(re.sub(r"[^A-Za-z0-9_.-]+", "-", name).strip("-.") or "x" for name in names)

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dine.evaluation.statistics import verdicts
+from dine.evaluation.statistics import rounded, verdicts
 from dine.reporting import names
-from dine.reporting.loading import origin_of, rounded
-from dine.reporting.names import CD_SCALE, DASH, display_name, mean_and_deviation, rank
+from dine.reporting.loading import origin_of
+from dine.reporting.names import CD_SCALE, DASH, display_name, in_order, mean_and_deviation, rank
 from dine.reporting.table import Cell, Columns, Table, laid_out
 from dine.results import CLEAN, PAPER_TABLES, table_name, trained_on
 
@@ -126,20 +126,6 @@ def _decided(metrics: pd.DataFrame, value: str, spread: float) -> pd.DataFrame:
     return found[found["level"].notna() == (found["condition"] == CLEAN)]
 
 
-def _sorted(frame: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
-    orders = {
-        "condition": names.CONDITIONS,
-        "backbone": ["", *names.BACKBONES],
-        "method": names.METHODS,
-    }
-
-    def ranks(column: pd.Series) -> pd.Series:
-        order = orders.get(column.name)
-        return column if order is None else column.map(lambda name: rank(name, order))
-
-    return frame.sort_values(keys, key=ranks, kind="stable", ignore_index=True)
-
-
 def _compare(
     dataset: str, metrics: pd.DataFrame, kind: Kind, reference: pd.DataFrame, spread: float
 ) -> pd.DataFrame:
@@ -169,7 +155,7 @@ def _compare(
     data["verdict"] = data["verdict"].fillna("")
     data.insert(0, "dataset", dataset)
     data.insert(1, "origin", origin_of(dataset, metrics) or "")
-    return _sorted(data, keys)
+    return in_order(data, keys)
 
 
 def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
@@ -220,7 +206,7 @@ def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
     # An interval of the difference, turned into one of the reduction.
     turned = decided.assign(low=-decided["high"], high=-decided["low"])
     found = found.merge(turned[[*keys, "low", "high", "verdict"]], on=keys, how="left")
-    return _sorted(found, keys)
+    return in_order(found, keys)
 
 
 def _gain(before: float, after: float) -> float:
@@ -364,7 +350,7 @@ def _origin_sentence(dataset: str, metrics: pd.DataFrame, with_paper: bool) -> s
 
 def _layout(data: pd.DataFrame, decimals: int, with_paper: bool) -> dict[str, tuple]:
     """Header and display rows: settings down, methods by backbone across, ours above published."""
-    series = _sorted(data[_SERIES].drop_duplicates(), _SERIES)
+    series = in_order(data[_SERIES].drop_duplicates(), _SERIES)
     bare = series["method"] == "unregistered"
     series = pd.concat([series[bare], series[~bare]])
     labels = ["Setting", "Level"] if (data["condition"] != CLEAN).any() else ["Level"]
