@@ -161,7 +161,8 @@ def register(source, target, out, further, settings, writing, load_model):
     """Move SOURCE onto TARGET: any mesh or point file, any number of points, any units.
 
     Beside the moved source OUT go the displacement of every vertex (OUT.field.npz, OUT.field.vtp),
-    a report (OUT.json) and, with --view, a page to look at (OUT.html).
+    what `dine apply` needs (OUT.result.npz), a report (OUT.json) and, with --view, a page to look
+    at (OUT.html).
     """
     from dine.io.readers import read_surface
     from dine.io.writers import check_holds
@@ -188,6 +189,33 @@ def register(source, target, out, further, settings, writing, load_model):
     )
     for sentence in (*result.trust.reasons, *said):
         click.echo(f"  {sentence}")
+
+
+@click.command(
+    epilog="""
+    Examples:
+
+    \b
+    dine apply moved.ply tumour.stl vessels.vtp -o moved
+    dine apply results/scans/first landmarks.fcsv -o moved
+    """
+)
+@click.argument("result", type=click.Path(exists=False, path_type=Path))
+@click.argument("files", nargs=-1, required=True, type=IN)
+@click.option("-o", "--out", type=OUT_FOLDER, required=True, help="Folder of the moved files.")
+@click.option("--suffix", default="", help="Format to write, such as .ply; by default their own.")
+@click.option("--overwrite", is_flag=True, help="Replace files that are there already.")
+def apply(result, files, out, suffix, overwrite):
+    """Move FILES, which lie in the source's coordinates, as RESULT moved its source.
+
+    RESULT is a file that `dine register` wrote (such as moved.ply), or its folder.
+    """
+    from dine.registration.output import move_files
+    from dine.registration.saved import load_result
+
+    start_torch()
+    for line in move_files(load_result(result), files, out, suffix=suffix, overwrite=overwrite):
+        click.echo(line)
 
 
 @click.command(

@@ -42,8 +42,8 @@ from scipy.spatial.transform import Rotation
 
 from dine.errors import DataError
 
-# Beyond this many radii from the middle of the samples only the rigid motion still changes.
-_REACH = 2.0
+REACH = 2.0
+"""Beyond so many radii from the middle of the samples only the rigid motion still changes."""
 # Least width of a principal axis, as a share of the widest, that a linear part is fitted along.
 _WIDE = 0.2
 # Samples that are solved for at once: a dense system of 128 MiB.
@@ -77,6 +77,7 @@ class FittedDisplacement:
 
     def __init__(self, points: np.ndarray, displacement: np.ndarray):
         points, displacement = _checked(points, displacement, 3)
+        self.points, self.displacement = points, displacement
         self._centre, self._radius = _extent(points)
         sites = (points - self._centre) / self._radius
         sites, field = _thinned(sites, displacement / self._radius)
@@ -209,6 +210,6 @@ def _evaluated(spline: RBFInterpolator, places: np.ndarray, columns: int) -> np.
 
 
 def within_reach(places: np.ndarray) -> np.ndarray:
-    """Places farther out than ``_REACH`` drawn straight towards the middle."""
+    """Places farther out than ``REACH`` drawn straight towards the middle."""
     distance = np.linalg.norm(places, axis=1, keepdims=True)
-    return places * (_REACH / np.maximum(distance, _REACH))
+    return places * (REACH / np.maximum(distance, REACH))

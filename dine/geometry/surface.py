@@ -77,6 +77,10 @@ class Surface:
             )
         object.__setattr__(self, "faces", faces)
 
+    def __repr__(self) -> str:
+        faces = "" if self.faces is None else f", {len(self.faces)} faces"
+        return f"<Surface {self.name}: {len(self.vertices)} vertices{faces}>"
+
     @property
     def used(self) -> np.ndarray:
         """Mask (V,) of the vertices that the object consists of: of a mesh those of its faces."""

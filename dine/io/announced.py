@@ -195,6 +195,21 @@ def member(path: str | os.PathLike, archive: zipfile.ZipFile, name: str, *, stor
     return archive.read(info)
 
 
+def npz_arrays(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All arrays of a ``.npz`` file by name.
+
+    Raises:
+        DataError: a member grows to more than compressed data can, or announces more than it holds.
+        ValueError: no such file, or one with objects; so are a few other exceptions of the parsers.
+    """
+    stored = os.path.getsize(path)
+    with zipfile.ZipFile(path) as archive:
+        return {
+            name.removesuffix(".npy"): npy_array(path, member(path, archive, name, stored=stored))
+            for name in archive.namelist()
+        }
+
+
 # --- MATLAB -----------------------------------------------------------------------------------
 
 _MATRIX, _COMPRESSED = 14, 15

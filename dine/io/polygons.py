@@ -37,3 +37,19 @@ def small(ends: np.ndarray) -> bool:
     """Whether a cell has 1 or 2 corners: points and edges among the faces."""
     counts = np.diff(ends, prepend=0)
     return bool(((counts > 0) & (counts < 3)).any())
+
+
+def counted(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of all cells, and where each ends, of a list of each cell's length and corners.
+
+    Raises:
+        ValueError: the lengths do not add up.
+    """
+    starts, place = [], 0
+    while place < len(table):
+        starts.append(place)
+        place += 1 + max(int(table[place]), 0)
+    if place != len(table):
+        raise ValueError("the lengths of its cells do not add up")
+    ends = np.array([*starts[1:], place], dtype=np.int64) - np.arange(1, len(starts) + 1)
+    return np.delete(table, starts), ends

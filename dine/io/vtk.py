@@ -294,15 +294,10 @@ class _Legacy:
             return self.numbers(second, kind[0]).astype(np.int64), ends
         # Before version 5: each cell's number of corners, then these.
         self.place = here
-        table = self.numbers(second, b"int").astype(np.int64)
-        starts = np.empty(first, dtype=np.int64)
-        place = 0
-        for cell in range(first):
-            starts[cell] = place
-            place += 1 + table[place]
-        if place != len(table):
+        corners, ends = polygons.counted(self.numbers(second, b"int").astype(np.int64))
+        if len(ends) != first:
             raise ValueError("the lengths of its cells do not add up")
-        return np.delete(table, starts), np.append(starts[1:], place) - np.arange(1, first + 1)
+        return corners, ends
 
     def data_of(self, count: int, left_out: dict[str, None]) -> Iterator[tuple[str, np.ndarray]]:
         """Arrays of so many points by name, from here on; what is none goes to ``left_out``."""

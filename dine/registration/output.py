@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,14 +10,20 @@ import numpy as np
 
 from dine.errors import DataError
 from dine.files import write_json
+from dine.geometry.interpolation import REACH
 from dine.geometry.surface import Surface
+from dine.io.readers import read_surface
+from dine.io.text import format_stem
 from dine.io.writers import (
     SURFACE_SUFFIXES,
+    check_holds,
     check_output,
     write_field,
     write_moved,
     written_suffix,
 )
+from dine.registration.saved import ENDING, write_result
+from dine.registration.shapes import check_spaces
 from dine.registration.types import RegistrationResult
 from dine.viewer.view import View, write_view
 
@@ -27,13 +33,18 @@ class Outputs:
     """Where everything goes, beside the moved source ``NAME.SUFFIX``.
 
     ``NAME.field.npz`` and ``NAME.field.vtp`` hold the displacement of every vertex,
-    ``NAME.json`` the report, ``NAME.html`` the view, ``NAME.<shape>.<suffix>`` further shapes.
+    ``NAME.result.npz`` everything for ``load_result``, ``NAME.json`` the report, ``NAME.html`` the
+    view, ``NAME.<shape>.<suffix>`` further shapes.
     """
 
     moved: Path
 
     def beside(self, ending: str) -> Path:
         return self.moved.with_name(f"{self.moved.stem}.{ending}")
+
+    @property
+    def result(self) -> Path:
+        return self.beside(ENDING)
 
     @property
     def report(self) -> Path:
@@ -57,7 +68,7 @@ class Outputs:
             StorageError: a file is there already.
         """
         check_output(self.moved, SURFACE_SUFFIXES, overwrite=overwrite)
-        others = [self.beside("field.npz"), self.beside("field.vtp"), self.report]
+        others = [self.beside("field.npz"), self.beside("field.vtp"), self.result, self.report]
         others += [self.view] * view
         if self.moved in others:
             raise DataError(f"{self.moved} is the name of another output; choose another one.")
@@ -91,11 +102,11 @@ def save(
         Sentences on what a format could not hold.
     """
     scalars = _scalars(result)
-    said = _lost(result.source)
+    said = lost(result.source)
     left_out = write_moved(
         outputs.moved, result.moved, scalars=_words(scalars), overwrite=overwrite
     )
-    said += _cannot_hold(outputs.moved, left_out)
+    said += cannot_hold(outputs.moved, left_out)
     field = {
         "points": result.source.vertices,
         "displacement": result.displacement,
@@ -106,8 +117,8 @@ def save(
         write_field(outputs.beside(ending), **field, overwrite=overwrite)
     for name, surface in result.applied.items():
         path = outputs.applied(name, applied[name] if applied else None)
-        said += _lost(surface)
-        said += _cannot_hold(path, write_moved(path, surface, overwrite=overwrite))
+        said += lost(surface)
+        said += cannot_hold(path, write_moved(path, surface, overwrite=overwrite))
     if view:
         shown = View(
             _aligned_source(result),
@@ -119,18 +130,75 @@ def save(
             facts=_facts(result),
         )
         write_view(outputs.view, shown, overwrite=overwrite)
+    write_result(outputs.result, result)
     write_json(outputs.report, result.report)
     return said
 
 
-def _lost(surface: Surface) -> list[str]:
+def move_files(
+    result: RegistrationResult,
+    files: Sequence[Path],
+    folder: Path,
+    *,
+    suffix: str = "",
+    overwrite: bool = False,
+) -> Iterator[str]:
+    """Move files as a registration moved its source, into a folder, under their own names.
+
+    Everything is read and looked at before the first is written.
+
+    Args:
+        result: of the registration.
+        files: shapes in the source's coordinates.
+        folder: made where it is missing.
+        suffix: format of all; by default each one's own, or PLY where that is only read.
+        overwrite: replace files that are there already.
+
+    Yields:
+        A line on each, and what there is to say of it.
+
+    Raises:
+        DataError: unreadable, in another space, or two would have one name.
+        StorageError: a file is there already, or the folder cannot be written.
+    """
+    paths = [
+        folder / f"{format_stem(file)}{suffix or written_suffix(file, '.ply')}" for file in files
+    ]
+    if len(set(paths)) < len(paths):
+        raise DataError("Two of the files to move have the same name; rename one.")
+    for path in paths:
+        check_output(path, SURFACE_SUFFIXES, overwrite=overwrite)
+    shapes = [read_surface(file) for file in files]
+    check_spaces(result.source, shapes)
+    for path, surface in zip(paths, shapes, strict=True):
+        check_holds(path, surface)
+    for path, surface in zip(paths, shapes, strict=True):
+        left_out = write_moved(path, result.transform(surface), overwrite=overwrite)
+        yield str(path)
+        yield from (f"  {sentence}" for sentence in (*_far(result, surface), *lost(surface)))
+        yield from (f"  {sentence}" for sentence in cannot_hold(path, left_out))
+
+
+def _far(result: RegistrationResult, surface: Surface) -> list[str]:
+    """What to say of a shape that lies beside the source, as one in other units does."""
+    places = result.alignment.normalise(surface.vertices[surface.used])
+    share = float((np.linalg.norm(places, axis=1) > REACH).mean())
+    if share == 0:
+        return []
+    return [
+        f"{100 * share:.0f} % of its points lie farther than two radii from the source and follow "
+        "its rigid motion; check that both are in the same units and coordinates."
+    ]
+
+
+def lost(surface: Surface) -> list[str]:
     """What of a file was not read."""
     if not surface.left_out:
         return []
     return [f"Not kept of {Path(surface.name).name}: {', '.join(surface.left_out)}."]
 
 
-def _cannot_hold(path: Path, left_out: tuple[str, ...]) -> list[str]:
+def cannot_hold(path: Path, left_out: tuple[str, ...]) -> list[str]:
     return [f"{path.name} cannot hold: {', '.join(left_out)}."] if left_out else []
 
 

@@ -136,6 +136,7 @@ def _registered(
         trust,
         report,
         alignment=pair.alignment,
+        motion=motion,
     )
 
 

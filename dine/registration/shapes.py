@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,9 +16,11 @@ from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.slicer import in_space
 from dine.io.text import format_stem
+from dine.registration.objects import array_of, surface_of
 
-Shape = str | Path | Surface | np.ndarray | tuple[np.ndarray, np.ndarray]
-"""A file, a surface, (V, 3) points, or vertices and faces."""
+Shape = str | Path | Surface | np.ndarray | tuple[np.ndarray, np.ndarray] | Any
+"""A file, a surface, (V, 3) points, vertices and faces, or a mesh or cloud of trimesh, Open3D,
+PyVista or meshio. Arrays may be tensors of PyTorch."""
 
 POINTS = 1024
 FEWEST = 16
@@ -39,15 +42,33 @@ def as_surface(shape: Shape, name: str) -> Surface:
     """Any accepted form as a surface.
 
     Raises:
-        DataError: a file that cannot be read, or an array of another shape.
+        DataError: a file that cannot be read, an array of another shape, or another object.
     """
     if isinstance(shape, Surface):
         return shape
     if isinstance(shape, str | Path):
         return read_surface(shape)
-    if isinstance(shape, tuple):
-        return Surface(shape[0], shape[1], name=f"The {name}")
-    return Surface(np.asarray(shape), name=f"The {name}")
+    if isinstance(shape, tuple) and len(shape) == 2:
+        vertices, faces = (None if part is None else array_of(part) for part in shape)
+        return Surface(vertices, faces, name=f"The {name}")
+    return surface_of(shape, f"The {name}")
+
+
+def checked_points(points: Any) -> np.ndarray:
+    """(M, 3) finite points, as float64; M may be 0.
+
+    Raises:
+        DataError: another shape, no numbers, or some that are not finite.
+    """
+    try:
+        found = np.asarray(array_of(points), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"The points are no array of numbers ({error}).") from None
+    if found.ndim != 2 or found.shape[1] != 3 or not np.isfinite(found).all():
+        raise DataError(
+            f"The points have the shape {found.shape}; expected finite numbers of shape (M, 3)."
+        )
+    return found
 
 
 def shapes_by_name(paths: Sequence[Path]) -> dict[str, Path]:
@@ -92,7 +113,7 @@ def checked_landmarks(
 def _in_space_of(points: Points, scan: Surface) -> np.ndarray:
     if isinstance(points, str | Path):
         return in_space(read_surface(points), scan.space or "LPS")
-    return np.asarray(points, dtype=np.float64)
+    return np.asarray(array_of(points), dtype=np.float64)
 
 
 def check_spaces(source: Surface, others: Iterable[Surface]) -> None:

@@ -15,7 +15,8 @@ from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.rigid import Alignment
 from dine.geometry.surface import Surface
 from dine.registration.calibration import Calibration
-from dine.registration.shapes import dense_points
+from dine.registration.objects import is_object
+from dine.registration.shapes import Shape, as_surface, checked_points, dense_points
 
 
 @dataclass(frozen=True)
@@ -195,6 +196,7 @@ class RegistrationResult:
         trust: how far to trust the result.
         report: everything that the JSON report says.
         alignment: of the source to the target, and the normalised frame there.
+        motion: the field itself, which moves any points.
     """
 
     source: Surface
@@ -211,6 +213,59 @@ class RegistrationResult:
     report: dict[str, Any] = field(default_factory=dict)
     _: KW_ONLY
     alignment: Alignment
+    motion: Motion
+
+    def __repr__(self) -> str:
+        error = self.trust.expected_error
+        measures = (f"{self.report[when]['hd95']:.3g}" for when in ("before", "after"))
+        return (
+            f"<RegistrationResult {self.source.name} → {self.target.name}: "
+            f"HD95 {' → '.join(measures)}, {self.trust.verdict}"
+            + (f", expected error {error:.3g}>" if error is not None else ">")
+        )
+
+    def transform(self, shape: Shape) -> Any:
+        """Move anything that lies in the source's coordinates.
+
+        Farther than two radii from the object, points follow its rigid motion.
+
+        Args:
+            shape: (M, 3) points, or whatever ``register`` takes as a scan.
+
+        Returns:
+            The moved points as an array (M, 3), or the moved surface of anything else.
+
+        Raises:
+            DataError: unreadable, other shapes, or numbers that are not finite.
+        """
+        if isinstance(shape, Surface | str | Path | tuple) or is_object(shape):
+            return self.motion.surface(as_surface(shape, "shape"))
+        return self.motion(checked_points(shape))
+
+    def save(
+        self, folder: str | Path, *, suffix: str = ".ply", view: bool = False, overwrite=False
+    ) -> list[str]:
+        """Write all that ``dine register`` writes, named ``moved…``, into a folder.
+
+        Args:
+            folder: made where it is missing; :func:`~dine.registration.saved.load_result` reads it.
+            suffix: format of the moved source.
+            view: also write the page to look at.
+            overwrite: replace files that are there already.
+
+        Returns:
+            Sentences on what the format cannot hold.
+
+        Raises:
+            DataError: a suffix that is not written.
+            StorageError: a file is there already, or the folder cannot be written.
+        """
+        from dine.registration.output import Outputs, save
+
+        outputs = Outputs(Path(folder) / f"moved{suffix}")
+        names = dict.fromkeys(self.applied, Path(f"further{suffix}"))
+        outputs.check(names, view=view, overwrite=overwrite)
+        return save(self, outputs, applied=names, view=view, overwrite=overwrite)
 
     @property
     def distance_to_target(self) -> np.ndarray:

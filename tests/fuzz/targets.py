@@ -40,14 +40,20 @@ from dine.data.obtain import obtained
 from dine.data.pairs import PAIR_DATASETS, read_pairs, read_variant, write_pairs
 from dine.data.raw import synthesise
 from dine.evaluation.predictions import FORMAT, Prediction, put_prediction, read_predictions
+from dine.geometry.interpolation import FittedDisplacement
+from dine.geometry.rigid import Alignment
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_moved, write_surface
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior
+from dine.refinement.process import SURFACE
 from dine.registration.calibration import Calibration, load_calibration
 from dine.registration.many import read_jobs
+from dine.registration.saved import load_result, write_result
+from dine.registration.surfaces import ProcessField
+from dine.registration.types import Motion, RegistrationResult, Trust
 from dine.training.stage2 import selected_lambda
 from dine.training.stages import new_backbone
 from fuzz import mutations as m
@@ -302,6 +308,50 @@ def mat73() -> list[bytes]:
         file["vertices"] = BOX.vertices.T
         file["faces"] = BOX.faces.T + 1.0
     return [stream.getvalue()]
+
+
+@functools.cache
+def results() -> list[bytes]:
+    """Of both kinds of fields, without a registration."""
+    places = np.random.default_rng(0).normal(size=(20, 3))
+    root = SURFACE.fitted(places)
+    fields = (
+        FittedDisplacement(places, 0.1 * places),
+        ProcessField(root, np.full((root.root.shape[1], 3), 0.1)),
+    )
+    return [written(functools.partial(write_made, places, field), ".npz") for field in fields]
+
+
+def write_made(places: np.ndarray, field: Callable, path: Path) -> None:
+    alignment = Alignment.of(places, np.eye(4))
+    source, motion = everything(), Motion(alignment, field)
+    moved = motion.surface(source)
+    trust = {"verdict": "doubtful", "reasons": ["x"], "percentiles": {}, "expected_error": None}
+    made = RegistrationResult(
+        source,
+        source,
+        moved,
+        moved.vertices - source.vertices,
+        None,
+        {"further": Surface(places)},
+        places,
+        motion(places) - places,
+        None,
+        np.ones(len(places), bool),
+        Trust("doubtful", ("x",), {}, None),
+        {"trust": trust},
+        alignment=alignment,
+        motion=motion,
+    )
+    write_result(path, made)
+
+
+def result(path: Path) -> None:
+    found = load_result(path)
+    count = len(found.source.vertices)
+    assert found.moved.vertices.shape == found.displacement.shape == (count, 3)
+    assert found.points.shape == found.point_displacement.shape == (len(found.points), 3)
+    assert np.isfinite(found.transform(BOX.vertices)).all()
 
 
 # --- pairs, fields and predictions ------------------------------------------------------------
@@ -762,6 +812,9 @@ TARGETS: dict[str, Target] = {
     "h5": Target("a.h5", h5s, HDF5, surface, 2),
     "mat": Target("a.mat", mats, (*m.BYTES, *3 * (m.mat_elements,)), surface, 2),
     "mat73": Target("a.mat", mat73, HDF5, surface),
+    "result": Target(
+        "a.result.npz", results, (*m.BYTES, *5 * (m.zip_members(m.npy_header),)), result
+    ),
     "pairs": Target(
         "pairs.h5",
         lambda: [written(lambda path: write_pairs(path, make_pairs(20, 3)), ".h5")],

@@ -524,7 +524,7 @@ def test_command_writes_everything(files, tmp_path, pair):
     done = run("register", *files, "-o", out, "--points", POINTS, "--view", "--apply", files[0])
     assert done.exit_code == 0, done.output
     assert "HD95" in done.output
-    endings = {"obj", "field.npz", "field.vtp", "json", "html", "before.ply"}
+    endings = {"obj", "field.npz", "field.vtp", "result.npz", "json", "html", "before.ply"}
     assert {p.name.removeprefix("moved.") for p in out.parent.iterdir()} == endings
     moved = read_surface(out)
     assert (moved.faces == pair[0].faces).all()

@@ -44,7 +44,7 @@ def test_commands_take_any_name(name, tmp_path, monkeypatch):
     done = run("register", "-o", f"{name} out/{name}.ply", "--map", 1, "--view", "--", *files)
     assert done.exit_code == 0, done.output
     out = tmp_path / f"{name} out"
-    endings = ("field.npz", "field.vtp", "html", "json", "ply")
+    endings = ("field.npz", "field.vtp", "html", "json", "ply", "result.npz")
     assert sorted(path.name for path in out.iterdir()) == [f"{name}.{end}" for end in endings]
     assert len(read_surface(out / f"{name}.ply").vertices) == 60
     assert json.loads((out / f"{name}.json").read_text())["target"]["name"] == f"{name} after.ply"
