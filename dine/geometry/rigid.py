@@ -81,7 +81,17 @@ def check_rigid(matrix: np.ndarray, name: str = "The given alignment") -> np.nda
 
 
 def rigid_alignment(source: np.ndarray, target: np.ndarray, *, partial: bool = False) -> np.ndarray:
-    """The 4×4 rigid motion that brings (N, 3) source points onto (M, 3) target points.
+    """The first of :func:`rigid_alignments`."""
+    return rigid_alignments(source, target, partial=partial)[0]
+
+
+def rigid_alignments(
+    source: np.ndarray, target: np.ndarray, *, partial: bool = False
+) -> list[np.ndarray]:
+    """The 4×4 rigid motions that may bring (N, 3) source points onto (M, 3) target points.
+
+    The one that fits best comes first. A second one turns the source less: what was deformed much
+    can fit better the wrong way round, which shows only once it is deformed back.
 
     Iterative closest points (trimesh) from where the points are, from coinciding middles, and from
     coinciding principal axes; the last are taken only if they fit much better, since a symmetric
@@ -96,14 +106,15 @@ def rigid_alignment(source: np.ndarray, target: np.ndarray, *, partial: bool = F
     size = float(np.median(np.linalg.norm(source - centre, axis=1))) or 1.0
     a, b = ((points - centre) / size for points in (source, target))
     if partial:
-        motion = np.linalg.inv(_best_motion(b, a, both_ways=False))
+        motions = [np.linalg.inv(motion) for motion in _motions(b, a, both_ways=False)]
     else:
-        motion = _best_motion(a, b, both_ways=True)
-    motion[:3, 3] = size * motion[:3, 3] + centre - motion[:3, :3] @ centre
-    return motion
+        motions = _motions(a, b, both_ways=True)
+    for motion in motions:
+        motion[:3, 3] = size * motion[:3, 3] + centre - motion[:3, :3] @ centre
+    return motions
 
 
-def _best_motion(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray:
+def _motions(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> list[np.ndarray]:
     tree = cKDTree(b)
 
     def misfit(matrix: np.ndarray) -> float:
@@ -123,7 +134,7 @@ def _best_motion(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> np.ndarray
     if near[0] < _MUCH_BETTER * best[0]:
         best = near
     turned = best_of(_between_middles(a, b, rotation) for rotation in _between_axes(a, b))
-    return turned[1] if turned[0] < _MUCH_BETTER * best[0] else best[1]
+    return [turned[1], best[1]] if turned[0] < _MUCH_BETTER * best[0] else [best[1]]
 
 
 def _between_middles(a: np.ndarray, b: np.ndarray, rotation: np.ndarray) -> np.ndarray:

@@ -100,8 +100,10 @@ def refine_on_surface(
     starts: Sequence[np.ndarray],
     prior: LinearGaussian,
     options: SurfaceOptions = DEFAULTS,
-) -> Posterior:
-    """The field after some rounds, as the posterior of the last one.
+) -> tuple[Posterior, float]:
+    """The field after some rounds, as the posterior of the last one, and how improbable it is.
+
+    That is −log of its evidence: misfit + energy + complexity.
 
     Fields are found from every start, and with every first standard deviation until all starts lead
     to the same, on fewer points; the most probable of them goes on on all. Where the matches are
@@ -126,11 +128,12 @@ def refine_on_surface(
         fields = _fields(search, source, target, starts, prior, between)
         start = min(fields, key=lambda found: found[1] + search.observed(found[0], between)[2])[0]
         end = search.posterior(start, prior, np.geomspace(between, last, options.rounds))
+        improbability = search.observed(end.mean, last)[2] + end.energy + end.complexity
         _, precision, misfit = search.observed(prior.mean, last)
-        if misfit < search.observed(end.mean, last)[2] + end.energy + end.complexity:
+        if misfit < improbability:
             still = np.einsum("nab,nb->na", precision, prior.mean)
-            return Posterior(prior, still, precision)
-        return end
+            return Posterior(prior, still, precision), misfit
+        return end, improbability
 
 
 def _fields(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from dine.errors import ConfigError, DataError
 from dine.geometry.distance import distances
 from dine.geometry.frame import Frame
 from dine.geometry.interpolation import FittedDisplacement
-from dine.geometry.rigid import Alignment, check_rigid, rigid_alignment
+from dine.geometry.rigid import Alignment, check_rigid, rigid_alignments
 from dine.geometry.surface import Surface
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.refinement.refine import ROUNDS, Observed, Options, refine
@@ -29,8 +30,12 @@ _SAME = 1e-9
 _SHARED = 0.5
 
 
-def aligned_pair(source: Surface, target: Surface, settings: Settings, convention: str) -> Pair:
+def aligned_pairs(
+    source: Surface, target: Surface, settings: Settings, convention: str
+) -> list[Pair]:
     """Points of both, drawn, aligned and normalised; those of the source in a convention.
+
+    One pair for each alignment that is worth a try, the most likely first.
 
     Raises:
         DataError: too few points, points on a line, or a matrix that is not rigid.
@@ -40,22 +45,38 @@ def aligned_pair(source: Surface, target: Surface, settings: Settings, conventio
     samples = drawn(source, settings.points, rng, "source")
     seen = drawn(target, settings.points, rng, "target").places(target.vertices)
     places = samples.places(source.vertices)
-    alignment = Alignment.of(places, _motion(settings, places, seen))
-    start = alignment.normalise(places)
-    order = convention_order(start, convention)
-    goal = alignment.frame.normalise(seen)
-    return Pair(source, target, alignment, places[order], start[order], goal)
+    pairs = []
+    for motion in _motions(settings, places, seen):
+        alignment = Alignment.of(places, motion)
+        start = alignment.normalise(places)
+        order = convention_order(start, convention)
+        goal = alignment.frame.normalise(seen)
+        pairs.append(Pair(source, target, alignment, places[order], start[order], goal))
+    return pairs
 
 
-def _motion(settings: Settings, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+def _motions(settings: Settings, source: np.ndarray, target: np.ndarray) -> list[np.ndarray]:
     how = settings.prealign
     if not isinstance(how, str):
-        return check_rigid(how)
+        return [check_rigid(how)]
     if how == "off":
-        return np.eye(4)
+        return [np.eye(4)]
     if how == "auto":
-        return rigid_alignment(source, target, partial=settings.partial)
+        return rigid_alignments(source, target, partial=settings.partial)
     raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
+
+
+def most_probable(
+    pairs: Sequence[Pair], model: Model, settings: Settings
+) -> tuple[Pair, Correspondence]:
+    """Of several alignments the one whose correspondence explains the surfaces best.
+
+    The first where surfaces are not looked at, or little of the source is to be seen.
+    """
+    found = [(pairs[0], correspond(pairs[0], model, settings))]
+    if found[0][1].improbability is not None and not settings.partial:
+        found += [(pair, correspond(pair, model, settings)) for pair in pairs[1:]]
+    return min(found, key=lambda one: one[1].improbability or 0.0)
 
 
 def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:

@@ -15,7 +15,7 @@ from dine.geometry.surface import Surface
 from dine.models.devices import chosen_device
 from dine.refinement.refine import ROUNDS
 from dine.registration.assessment import Measures, assess, expected_error, measure
-from dine.registration.correspondence import aligned_pair, correspond
+from dine.registration.correspondence import aligned_pairs, most_probable
 from dine.registration.model import load_model
 from dine.registration.shapes import (
     POINTS,
@@ -99,8 +99,8 @@ def _registered(
     marks = None if landmarks is None else checked_landmarks(landmarks, source, target)
     check_spaces(source, (target, *further.values()))
     notes = check_sizes(source, target, settings.partial)
-    pair = aligned_pair(source, target, settings, model.convention)
-    correspondence = correspond(pair, model, settings)
+    pairs = aligned_pairs(source, target, settings, model.convention)
+    pair, correspondence = most_probable(pairs, model, settings)
     notes += _support(correspondence)
 
     motion = Motion(pair.alignment, correspondence.interpolated())

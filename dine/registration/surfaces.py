@@ -112,11 +112,17 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     start = ProcessField(root, _fitted(root, found.start, found.field))
     starts = [start(moving.places), np.zeros_like(moving.places)]
     options = SurfaceOptions(part=settings.partial)
-    posterior = refine_on_surface(moving, fixed, starts, prior, options)
+    posterior, improbability = refine_on_surface(moving, fixed, starts, prior, options)
     anywhere = ProcessField(root, posterior.alone)
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
-    return replace(found, field=anywhere(found.start), anywhere=anywhere, indicator=deviation)
+    return replace(
+        found,
+        field=anywhere(found.start),
+        anywhere=anywhere,
+        indicator=deviation,
+        improbability=improbability,
+    )
 
 
 def _fitted(root: CovarianceRoot, places: np.ndarray, field: np.ndarray) -> np.ndarray:

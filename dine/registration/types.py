@@ -104,6 +104,8 @@ class Correspondence:
             None where that was not tried.
         anywhere: the field as a function of (M, 3) places, normalised frame; None where it is
             known at ``start`` only.
+        improbability: −log of the evidence of the surfaces, up to a constant of the two scans; None
+            where only points were looked at.
     """
 
     start: np.ndarray
@@ -113,6 +115,7 @@ class Correspondence:
     supported: np.ndarray
     inconsistency: float | None = None
     anywhere: Callable[[np.ndarray], np.ndarray] | None = None
+    improbability: float | None = None
 
     def interpolated(self) -> Callable[[np.ndarray], np.ndarray]:
         """The field as a function of (M, 3) places, normalised frame."""

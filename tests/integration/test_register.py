@@ -471,7 +471,7 @@ def test_vertices_without_faces_take_no_part(pair, result, kind):
 
 
 def test_landmarks_are_checked_before_anything_is_computed(pair, monkeypatch):
-    monkeypatch.setattr(register_module, "aligned_pair", lambda *args: pytest.fail("computed"))
+    monkeypatch.setattr(register_module, "aligned_pairs", lambda *args: pytest.fail("computed"))
     points = pair[0].vertices[:5]
     for marks in ((points, points[:4]), (points[:, :2], points[:, :2])):
         with pytest.raises(DataError, match="expected as many rows of three coordinates"):
@@ -571,7 +571,7 @@ def test_command_keeps_what_is_known_of_vertices(files, tmp_path, pair):
 
 
 def test_command_probes_its_output_first(files, tmp_path, monkeypatch):
-    monkeypatch.setattr(register_module, "aligned_pair", lambda *args: pytest.fail("computed"))
+    monkeypatch.setattr(register_module, "aligned_pairs", lambda *args: pytest.fail("computed"))
     (tmp_path / "afile").write_text("precious")
     np.savetxt(tmp_path / "cloud.xyz", organ().vertices)
     for source, out, said in (
