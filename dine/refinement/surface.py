@@ -94,16 +94,29 @@ class Outline(NamedTuple):
         return np.vstack([self.surface.points, self.rim.points])
 
 
+class OnSurface(NamedTuple):
+    """What was found between two surfaces.
+
+    Attributes:
+        posterior: of the last round.
+        improbability: −log of its evidence: misfit + energy + complexity.
+        unmet: shares of the source's and of the target's points that lie on no surface of the
+            other.
+    """
+
+    posterior: Posterior
+    improbability: float
+    unmet: tuple[float, float]
+
+
 def refine_on_surface(
     source: Outline,
     target: Outline,
     starts: Sequence[np.ndarray],
     prior: LinearGaussian,
     options: SurfaceOptions = DEFAULTS,
-) -> tuple[Posterior, float]:
-    """The field after some rounds, as the posterior of the last one, and how improbable it is.
-
-    That is −log of its evidence: misfit + energy + complexity.
+) -> OnSurface:
+    """The field after some rounds.
 
     Fields are found from every start, and with every first standard deviation until all starts lead
     to the same, on fewer points; the most probable of them goes on on all. Where the matches are
@@ -132,8 +145,8 @@ def refine_on_surface(
         _, precision, misfit = search.observed(prior.mean, last)
         if misfit < improbability:
             still = np.einsum("nab,nb->na", precision, prior.mean)
-            return Posterior(prior, still, precision), misfit
-        return end, improbability
+            end, improbability = Posterior(prior, still, precision), misfit
+    return OnSurface(end, improbability, search.unmet(end.mean, last))
 
 
 def _fields(
@@ -231,25 +244,17 @@ class _Search:
         moved = self.source.points + field
         count = len(moved)
         index, matched, ours = self._matches(moved, options.turning * deviation)
-        theirs = self.target.normals[matched]
-        offset = self.target.points[matched] - moved[index]
-        agreeing = np.einsum("nc,nc->n", ours, theirs) > self.least
+        offset, normal, squared, agreeing = self._apart(moved, index, matched, ours)
+        squared /= (options.reach * deviation) ** 2
         if options.part:
             agreeing[:count] = False
         # What lies beyond the end of a surface finds its rim, wherever it belongs.
         agreeing &= ~np.concatenate(
             [self.target.rim[matched[:count]], self.source.rim[index[count:]]]
         )
-        normal = unit(ours + theirs)
         # As much weight for the target's points as for the source's.
         scale = np.ones(len(index))
         scale[count:] = count / len(self.asking)
-        across = np.einsum("nc,nc->n", normal, offset)
-        beside = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0))
-        # The nearest drawn point is not where it might be drawn.
-        for rows, spacing in zip((slice(count), slice(count, None)), self.spacings, strict=True):
-            beside[rows] = np.maximum(beside[rows] - spacing, 0)
-        squared = (across**2 + beside**2) / (options.reach * deviation) ** 2
         unexplained = np.where(agreeing, squared / (1 + squared), 1.0)
         misfit = 0.5 * options.reach**2 * float((scale * unexplained).sum())
 
@@ -266,6 +271,35 @@ class _Search:
         pull = along[:, None] * wanted + across * np.einsum("nc,nc->n", normal, wanted)[:, None]
         pulled = np.column_stack([np.bincount(index, column, count) for column in pull.T])
         return pulled, precision, misfit
+
+    def _apart(
+        self, moved: np.ndarray, index: np.ndarray, matched: np.ndarray, ours: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of matches, first those that the source looked for: the offset (n, 3) to the target, the
+        normal (n, 3) half way, the squared distance (n,), and whether normals agree (n,).
+
+        Distance counts across the surface, and along it beyond the spacing of the points: the
+        nearest drawn point is not where it might be drawn.
+        """
+        theirs = self.target.normals[matched]
+        offset = self.target.points[matched] - moved[index]
+        normal = unit(ours + theirs)
+        across = np.einsum("nc,nc->n", normal, offset)
+        beside = np.sqrt(np.maximum((offset**2).sum(axis=1) - across**2, 0))
+        count = len(moved)
+        for rows, spacing in zip((slice(count), slice(count, None)), self.spacings, strict=True):
+            beside[rows] = np.maximum(beside[rows] - spacing, 0)
+        agreeing = np.einsum("nc,nc->n", ours, theirs) > self.least
+        return offset, normal, across**2 + beside**2, agreeing
+
+    def unmet(self, field: np.ndarray, deviation: float) -> tuple[float, float]:
+        """Shares of source and target points that the field (N + E, 3) brings to no match."""
+        count = len(self.source.points)
+        moved = self.source.points + field[:count]
+        index, matched, ours = self._matches(moved, self.options.turning * deviation)
+        _, _, squared, agreeing = self._apart(moved, index, matched, ours)
+        met = agreeing & (squared < (self.options.reach * deviation) ** 2)
+        return 1 - float(met[:count].mean()), 1 - float(met[count:].mean())
 
     def _matches(
         self, moved: np.ndarray, turning: float

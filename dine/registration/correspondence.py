@@ -103,6 +103,8 @@ def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence
     if settings.partial:
         return _from_part(pair.start, pair.goal, settings.rounds)
     there = one_way(model.backbone, pair.start, pair.goal, settings)
+    if settings.surfaces and settings.rounds:
+        return there  # surfaces will say more
     # The way back has a frame of its own, in which the target is the source.
     frame = Frame.of(pair.goal)
     seen, whole = frame.normalise(pair.goal), frame.normalise(pair.start)

@@ -112,7 +112,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     start = ProcessField(root, _fitted(root, found.start, found.field))
     starts = [start(moving.places), np.zeros_like(moving.places)]
     options = SurfaceOptions(part=settings.partial)
-    posterior, improbability = refine_on_surface(moving, fixed, starts, prior, options)
+    posterior, improbability, unmet = refine_on_surface(moving, fixed, starts, prior, options)
     anywhere = ProcessField(root, posterior.alone)
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
@@ -122,6 +122,8 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
         anywhere=anywhere,
         indicator=deviation,
         improbability=improbability,
+        # Of a part, and of what it is a part of, one side lacks much, but not the other.
+        unmet=unmet[1] if settings.partial else min(unmet),
     )
 
 

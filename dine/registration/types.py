@@ -106,6 +106,8 @@ class Correspondence:
             known at ``start`` only.
         improbability: −log of the evidence of the surfaces, up to a constant of the two scans; None
             where only points were looked at.
+        unmet: share of the surface, of the scan that lacks less, that lies on none of the other;
+            None where only points were looked at.
     """
 
     start: np.ndarray
@@ -116,6 +118,7 @@ class Correspondence:
     inconsistency: float | None = None
     anywhere: Callable[[np.ndarray], np.ndarray] | None = None
     improbability: float | None = None
+    unmet: float | None = None
 
     def interpolated(self) -> Callable[[np.ndarray], np.ndarray]:
         """The field as a function of (M, 3) places, normalised frame."""
