@@ -209,7 +209,7 @@ def test_calibration_interpolates_and_ranks(tmp_path):
         ({"in_span": 90.0}, IMPLAUSIBLE, "less likely"),
         ({"in_span": 2.5, "residual": 2.5}, IMPLAUSIBLE, "principal components"),
         ({"folding": 0.3}, IMPLAUSIBLE, "inside out"),
-        ({"folding": 0.03}, DOUBTFUL, "inside out"),
+        ({"folding": 0.07}, DOUBTFUL, "inside out"),
     ],
 )
 def test_verdicts(values, verdict, said):
@@ -225,6 +225,9 @@ def test_verdicts(values, verdict, said):
         ({"remaining": 0.6}, "60 % of the Chamfer distance before is left"),
         ({"uncertain": 1.1}, "expected error is larger than the displacement"),
         ({"inconsistency": 0.12}, "and back, points end up 12 % of"),
+        ({"unmet": 0.14, "unsure": 0.05}, None),
+        ({"unmet": 0.2}, "20 % of the surface does not come to lie on the other scan"),
+        ({"unsure": 0.08}, "expected error is 8 % of the object's radius"),
     ],
 )
 def test_checks_make_a_result_doubtful(checks, said):
@@ -374,13 +377,15 @@ def test_bad_settings_are_refused(pair, settings, said):
         dine.register(*pair, **{"points": POINTS, **settings})
 
 
-def test_objects_without_anything_in_common_are_not_called_plausible(pair, result):
+def test_objects_without_anything_in_common_are_not_called_plausible(pair):
     source = pair[0]
     plate = np.random.default_rng(8).uniform(-1, 1, size=(2000, 3)) * [1.5, 1.5, 0.01]
-    found = dine.register(source, plate, points=POINTS)
-    assert found.trust.verdict != GOOD
+    for surfaces in (True, False):
+        found = dine.register(source, plate, points=POINTS, surfaces=surfaces)
+        assert found.trust.verdict != GOOD
     assert "and back" in " ".join(found.trust.reasons)
-    inconsistency = [x.report["trust"]["checks"]["inconsistency"] for x in (result, found)]
+    again = dine.register(*pair, points=POINTS, surfaces=False)
+    inconsistency = [x.report["trust"]["checks"]["inconsistency"] for x in (again, found)]
     assert inconsistency[0] < 0.1 < inconsistency[1]
 
 
@@ -399,9 +404,12 @@ def test_inches_and_centimetres_are_told_apart():
     assert "in inches and the other in centimetres" in found.trust.reasons[0]
 
 
-def test_nothing_to_move_is_not_called_plausible(pair):
+def test_points_alone_cannot_say_that_nothing_moves(pair):
     source = pair[0]
-    found = dine.register(source, Surface(source.vertices + 1e-3, source.faces), points=POINTS)
+    target = Surface(source.vertices + 1e-3, source.faces)
+    found = dine.register(source, target, points=POINTS)
+    assert np.linalg.norm(found.moved.vertices - target.vertices, axis=1).mean() < 4e-3
+    found = dine.register(source, target, points=POINTS, surfaces=False)
     assert found.report["trust"]["checks"]["remaining"] > 0.5
     assert found.trust.verdict == DOUBTFUL
     assert "may be noise" in " ".join(found.trust.reasons)
@@ -730,7 +738,7 @@ def test_calibration_of_own_weights(tmp_path):
     assert {"initial", "final", "in_span", "residual"} <= set(found.reference)
     assert out.with_suffix(".png").stat().st_size > 5000
     model = load_model(weights=weights, prior=prior, calibration=out)
-    result = dine.register(source[0], target[0], model=model)
+    result = dine.register(source[0], target[0], model=model, surfaces=False)
     assert result.uncertainty.shape == (points,)
     assert (result.uncertainty >= 0).all()
     assert result.trust.expected_error > 0
