@@ -18,7 +18,7 @@ import shlex
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -51,7 +51,22 @@ _STDLIB = sysconfig.get_paths()["stdlib"]
 _LIBRARIES = frozenset({"site-packages", "dist-packages"})
 
 
-@functools.cache
+_read: list[functools._lru_cache_wrapper] = []
+
+
+def _read_once(function: Callable) -> functools._lru_cache_wrapper:
+    """Keep what is found out about code, which does not change while a process runs."""
+    _read.append(functools.cache(function))
+    return _read[-1]
+
+
+def forget() -> None:
+    """Read code anew, where it did change."""
+    for found in _read:
+        found.cache_clear()
+
+
+@_read_once
 def code_digest(step: str, *classes: str) -> str:
     """Digest of the code behind a step: changes when that does, not with comments or docstrings.
 
@@ -70,7 +85,7 @@ def code_digest(step: str, *classes: str) -> str:
     return digest.hexdigest()[:16]
 
 
-@functools.cache
+@_read_once
 def _meaning(file: Path) -> bytes:
     """Digest of what a file says: of Python its syntax tree, of anything else its bytes."""
     content = _tree(_parsed(file)).encode() if file.suffix == ".py" else file.read_bytes()
@@ -87,7 +102,7 @@ def _tree(node: Any) -> str:
     return f"{type(node).__name__}({','.join(f'{name}={_tree(x)}' for name, x in fields)})"
 
 
-@functools.cache
+@_read_once
 def code_files(step: str, *classes: str) -> dict[str, Path]:
     """The source files behind a step, and what they read from beside themselves, by name.
 
@@ -102,7 +117,7 @@ def code_files(step: str, *classes: str) -> dict[str, Path]:
     return found
 
 
-@functools.cache
+@_read_once
 def _command(step: str) -> tuple[str, tuple[str, ...]]:
     """What a command does, as text without its help, and the modules that it imports."""
     name = step.replace("-", "_")
@@ -131,7 +146,7 @@ def _modules_of(name: str) -> list[str]:
     return [module]
 
 
-@functools.cache
+@_read_once
 def _registered() -> dict[str, list[str]]:
     """Modules of ``dine`` by the names under which they register classes."""
     found: dict[str, list[str]] = {}
@@ -173,7 +188,7 @@ def _add_data(file: Path, found: dict[str, Path]) -> None:
                 _add_data(path, found)
 
 
-@functools.cache
+@_read_once
 def _parsed(file: Path) -> ast.Module:
     """The syntax tree of a module, without docstrings and other statements that are mere text."""
     try:
@@ -193,7 +208,7 @@ def _is_text(statement: ast.stmt) -> bool:
     return isinstance(statement.value.value, str)
 
 
-@functools.cache
+@_read_once
 def _imported(module: str, file: Path) -> tuple[str, ...]:
     return tuple(dict.fromkeys(_imports(_parsed(file).body, module, file.name == "__init__.py")))
 
@@ -239,7 +254,7 @@ def _defining(module: str, name: str) -> str:
     return module
 
 
-@functools.cache
+@_read_once
 def _source(module: str) -> Path | None:
     """The Python file of a module, found without importing anything; None if it has none."""
     top, *below = module.split(".")

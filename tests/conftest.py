@@ -82,17 +82,7 @@ def fresh(monkeypatch):
     """Forget before and after what was found out about code; call it to forget again."""
 
     def forget():
-        for found in (
-            provenance.code_digest,
-            provenance.code_files,
-            provenance._meaning,
-            provenance._command,
-            provenance._registered,
-            provenance._parsed,
-            provenance._imported,
-            provenance._source,
-        ):
-            found.cache_clear()
+        provenance.forget()
         importlib.invalidate_caches()
 
     forget()
