@@ -38,7 +38,7 @@ from dine.data.fields import TrainingFields, read_fields, write_training_fields
 from dine.data.layout import scan
 from dine.data.obtain import obtained
 from dine.data.pairs import PAIR_DATASETS, read_pairs, read_variant, write_pairs
-from dine.data.raw import synthesise
+from dine.data.raw import Deformations, synthesise
 from dine.evaluation.predictions import FORMAT, Prediction, put_prediction, read_predictions
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.rigid import Alignment
@@ -634,21 +634,21 @@ def raw_facts(path: Path) -> None:
 
 def provenance() -> list[bytes]:
     def write(path: Path) -> None:
-        synthesise(path.parent / "made", "tissue", 1, **RECIPE)
+        synthesise(path.parent / "made", RECIPE, "tissue", 1)
         path.write_bytes((path.parent / "made" / "provenance.json").read_bytes())
 
     return [written(write, ".json")]
 
 
-RECIPE = {
-    "levels": [0.3],
-    "control_percents": [5],
-    "widths": [0.3],
-    "amplitude": 0.1,
-    "points": 64,
-    "pairs_per_level": 1,
-    "seed": 0,
-}
+RECIPE = Deformations(
+    levels=[0.3],
+    control_percents=[5],
+    widths=[0.3],
+    amplitude=0.1,
+    points=64,
+    pairs_per_level=1,
+    seed=0,
+)
 
 
 def made_folder(path: Path) -> None:
@@ -656,7 +656,7 @@ def made_folder(path: Path) -> None:
     folder = path.parent / "made"
     folder.mkdir()
     path.rename(folder / "provenance.json")
-    synthesise(folder, "tissue", 1, **RECIPE)
+    synthesise(folder, RECIPE, "tissue", 1)
     assert json.loads((folder / "provenance.json").read_text())["made_by"] == "dine.data.raw"
 
 
