@@ -94,6 +94,9 @@ def answer(connection):
     for number, file in enumerate(files):
         os.dup2(file, number)
         os.close(file)
+    # What they are now may be pipes, where they were files.
+    sys.stdout = open(1, "w", closefd=False)
+    sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)
     return started
 
 
