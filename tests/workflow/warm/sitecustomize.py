@@ -95,8 +95,8 @@ def answer(connection):
         os.dup2(file, number)
         os.close(file)
     # What they are now may be pipes, where they were files.
-    sys.stdout = open(1, "w", closefd=False)
-    sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)
+    sys.stdout = os.fdopen(1, "w", closefd=False)
+    sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
     return started
 
 
