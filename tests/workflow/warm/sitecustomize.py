@@ -9,6 +9,7 @@ does. As a script, this is the server. Never used where processes are killed or 
 import atexit
 import gc
 import importlib
+import io
 import json
 import os
 import pkgutil
@@ -94,9 +95,13 @@ def answer(connection):
     for number, file in enumerate(files):
         os.dup2(file, number)
         os.close(file)
-    # What they are now may be pipes, where they were files.
-    sys.stdout = os.fdopen(1, "w", closefd=False)
-    sys.stderr = os.fdopen(2, "w", buffering=1, errors="backslashreplace", closefd=False)
+    # What they are now may be pipes, where they were files. Unbuffered, as Python's own are here.
+    sys.stdout, sys.stderr = (
+        io.TextIOWrapper(
+            os.fdopen(number, "wb", 0, closefd=False), errors=errors, write_through=True
+        )
+        for number, errors in ((1, "strict"), (2, "backslashreplace"))
+    )
     return started
 
 
