@@ -95,10 +95,11 @@ def answer(connection):
     for number, file in enumerate(files):
         os.dup2(file, number)
         os.close(file)
-    # What they are now may be pipes, where they were files. Unbuffered, as Python's own are here.
+    # What they are now may be pipes, where they were files.
+    size, through = (0, True) if sys.flags.unbuffered else (-1, False)
     sys.stdout, sys.stderr = (
         io.TextIOWrapper(
-            os.fdopen(number, "wb", 0, closefd=False), errors=errors, write_through=True
+            os.fdopen(number, "wb", size, closefd=False), errors=errors, write_through=through
         )
         for number, errors in ((1, "strict"), (2, "backslashreplace"))
     )
