@@ -96,7 +96,8 @@ def answer(connection):
         os.dup2(file, number)
         os.close(file)
     # What they are now may be pipes, where they were files.
-    size, through = (0, True) if sys.flags.unbuffered else (-1, False)
+    through = sys.stdout.write_through  # so it is without buffers
+    size = 0 if through else -1
     sys.stdout, sys.stderr = (
         io.TextIOWrapper(
             os.fdopen(number, "wb", size, closefd=False), errors=errors, write_through=through
