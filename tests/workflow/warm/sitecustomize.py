@@ -97,10 +97,12 @@ def answer(connection):
         os.close(file)
     # What they are now may be pipes, where they were files.
     through = sys.stdout.write_through  # so it is without buffers
-    size = 0 if through else -1
     sys.stdout, sys.stderr = (
         io.TextIOWrapper(
-            os.fdopen(number, "wb", size, closefd=False), errors=errors, write_through=through
+            os.fdopen(number, "wb", 0 if through else -1, closefd=False),
+            errors=errors,
+            line_buffering=number == 2,
+            write_through=through,
         )
         for number, errors in ((1, "strict"), (2, "backslashreplace"))
     )
