@@ -288,6 +288,84 @@ class LatentFlowArguments(PCAResidualArguments):
     """AdamW's decoupled weight decay."""
 
 
+Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+Load = Literal["force", "pressure", "gravity", "shrinkage"]
+
+
+class Simulation(Section):
+    """Deformations of one organ by finite elements. Lengths are in radii of its mesh."""
+
+    fields: Count = 200
+    """Deformations."""
+    edge: Positive = 0.1
+    """Edge of the cubes."""
+    amplitude: Range = [0.05, 0.25]
+    """Mean displacement of the surface; less where a cube would be turned inside out."""
+    farthest: Positive = 0.6
+    """Largest displacement at a place, by linear elasticity; the loads are lessened otherwise."""
+    stiffness: Range = [0.5, 2.0]
+    """Young's modulus, relative to any, which varies smoothly over the organ."""
+    inclusion: Range = [2.0, 10.0]
+    """How many times stiffer an inclusion is, where one is given."""
+    poisson: Annotated[
+        list[Annotated[Positive, Field(lt=0.5)]], Field(min_length=2, max_length=2)
+    ] = [0.4, 0.48]
+    """Poisson ratio."""
+    patches: Count = 2
+    """Largest number of patches of the surface that are fixed, where none are given."""
+    patch: Range = [0.2, 0.5]
+    """Radius of such a patch."""
+    loads: list[Load] = Field(
+        default=["force", "force", "gravity", "gravity", "pressure", "shrinkage"], min_length=1
+    )
+    """Kinds of loads to draw from: on a place of the surface, on all of the organ, across the
+    surface at a place, and by heat within it. What is named twice comes twice as often."""
+    together: Count = 3
+    """Largest number of loads at once."""
+    width: Range = [0.3, 0.8]
+    """Width of loads on a place."""
+    shared: Count = 4
+    """Deformations that share what is fixed and how stiff it is."""
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        for name in ("amplitude", "stiffness", "inclusion", "poisson", "patch", "width"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(
+                    f"`{name}` goes from {low} down to {high}; expected the lower first"
+                )
+        return self
+
+
+class OrganLearning(Section):
+    """How the prior of one organ is learned. Lengths are in radii of its mesh."""
+
+    components: Count | None = None
+    """Principal components; by default as many as are best for deformations left out."""
+    candidates: list[Count] = Field(default=[5, 10, 20, 30, 40, 60, 80, 120], min_length=1)
+    """Numbers of components that are tried."""
+    folds: Annotated[Count, Field(ge=2)] = 5
+    """Parts that are left out in turn."""
+    points: Count = 200
+    """Vertices that the process is fitted at."""
+    edge: Positive = 0.1
+    """Edge of the cubes inside, where no simulation comes with some."""
+    widths: list[Positive] = Field(default=[0.3, 0.6, 1.2], min_length=1)
+    """Widths of the process for what the components miss; its amplitudes are fitted."""
+    mismatch: list[NonNegative] = [0.02, 0.0, 0.0]
+    """Amplitudes at these widths of what the fields themselves are wrong about, on top."""
+
+    @model_validator(mode="after")
+    def _paired(self):
+        if len(self.mismatch) != len(self.widths):
+            raise ValueError(
+                f"`mismatch` has {len(self.mismatch)} entries; expected one for each of the "
+                f"{len(self.widths)} `widths`"
+            )
+        return self
+
+
 class Training(Section):
     """What every training shares."""
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import click
 
 from dine import __version__
-from dine.cli import configuration, data, evaluation, registration, reporting, training
+from dine.cli import configuration, data, evaluation, organ, registration, reporting, training
 from dine.cli.options import OUT
 from dine.errors import DineError
 from dine.files import storage_errors
@@ -47,7 +47,7 @@ def cli(log_file: Path | None, threads: int | None):
 
 
 cli.add_command(configuration.config_group)
-for _module in (data, training, evaluation, reporting, registration):
+for _module in (data, training, evaluation, reporting, registration, organ):
     for _command in vars(_module).values():
         if isinstance(_command, click.Command):
             cli.add_command(_command)

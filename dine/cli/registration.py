@@ -21,7 +21,7 @@ from dine.cli.options import (
     start_torch,
     targets_option,
 )
-from dine.errors import DataError
+from dine.errors import ConfigError, DataError
 
 
 @click.command()
@@ -45,14 +45,23 @@ def scans(folder: Path):
 
 
 def _loader(backbone, weights, prior, calibration, precision):
-    """Loads the weights to register with, when it is called."""
+    """Loads what to register with, when it is called: ``model`` or the ``prior`` of an organ."""
 
     def load():
+        from h5py import is_hdf5
+
         from dine.registration.model import load_model
 
+        if prior is not None and is_hdf5(prior):
+            if any((backbone, weights, calibration)):
+                raise ConfigError(
+                    f"{prior} is the prior of an organ, with which no network registers; leave out "
+                    "--backbone, --weights and --calibration."
+                )
+            return {"prior": prior}
         model = load_model(backbone, weights=weights, prior=prior, calibration=calibration)
         model.backbone.precision = precision
-        return model
+        return {"model": model}
 
     return load
 
@@ -62,7 +71,11 @@ model_options = gathered(
     _loader,
     click.option("--backbone", help="Shipped weights to use; by default robust_defreg."),
     click.option("--weights", type=IN, help="Weights of ours or of the backbones' authors."),
-    click.option("--prior", type=IN, help="A fitted prior, for the trust score."),
+    click.option(
+        "--prior",
+        type=IN,
+        help="Of `learn`, to register its template by; or of `fit-prior`, for the trust score.",
+    ),
     click.option(
         "--calibration", type=IN, help="Of other weights than the shipped ones; `calibrate`."
     ),
@@ -131,6 +144,7 @@ view_option = click.option("--view", is_flag=True, help="Also write a page to tu
     \b
     dine register before.ply after.ply -o moved.ply --view
     dine register ct.stl us.obj -o moved.stl --apply tumour.stl --partial
+    dine register liver.ply scan.ply -o moved.ply --prior organ.prior --partial
     """
 )
 @click.argument("source", type=IN)
@@ -177,7 +191,7 @@ def register(source, target, out, further, settings, writing, load_model):
     moving = read_surface(source)
     check_holds(out, moving)
     marks = landmarks or None
-    result = run(moving, target, model=load_model(), apply=shapes, landmarks=marks, **settings)
+    result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
     said = save(result, outputs, applied=shapes, **writing)
     report = result.report
     expected = result.trust.expected_error
@@ -244,9 +258,11 @@ def register_many(manifest, out, suffix, settings, view, load_model):
     from dine.registration.many import register_many as run
 
     start_torch()
-    summary = run(
-        read_jobs(manifest), out, load_model(), suffix=suffix, view=view, settings=settings
-    )
+    loaded = load_model()
+    if "prior" in loaded:
+        raise ConfigError(f"{loaded['prior']} is the prior of an organ; `dine register` takes it.")
+    jobs = read_jobs(manifest)
+    summary = run(jobs, out, loaded["model"], suffix=suffix, view=view, settings=settings)
     failed = int((summary["state"] == "failed").sum())
     click.echo(f"{len(summary) - failed} of {len(summary)} registered; {out / 'summary.csv'}")
     if failed:

@@ -171,16 +171,19 @@ class Posterior:
         determined = len(inverse) - float((inverse**2).sum())
         return float(np.sqrt(2 * self.energy / max(determined, 1.0)))
 
-    def variance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
-        """Sum (M,) of the field's three variances where the prior has these rows of its kernel
-        (M, r), and modes (R, M, 3) if it has any."""
+    def covariance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
+        """(M, 3, 3) of the field where the prior has these rows of its kernel (M, r), and modes
+        (R, M, 3) if it has any."""
         first, rank = len(self.shared), len(self.alone)
-        total = np.zeros(len(kernel))
+        solved = np.empty((3, first + 3 * rank, len(kernel)))
         for axis in range(3):
-            rows = np.zeros((first + 3 * rank, len(kernel)))
+            rows = np.zeros(solved.shape[1:])
             if first:
                 rows[:first] = modes[:, :, axis]
             rows[first + axis * rank : first + (axis + 1) * rank] = kernel.T
-            solved = solve_triangular(self._factor[0], rows, lower=True, check_finite=False)
-            total += (solved**2).sum(axis=0)
-        return total
+            solved[axis] = solve_triangular(self._factor[0], rows, lower=True, check_finite=False)
+        return np.einsum("akm,bkm->mab", solved, solved, optimize=True)
+
+    def variance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
+        """Sum (M,) of the field's three variances, likewise."""
+        return np.trace(self.covariance(kernel, modes), axis1=1, axis2=2)

@@ -217,6 +217,8 @@ def _scalars(result: RegistrationResult) -> dict[str, np.ndarray]:
     }
     if result.uncertainty is not None:
         shown["expected error"] = result.uncertainty
+    if result.bound is not None:
+        shown["bound 90"] = result.bound
     return shown
 
 
@@ -237,6 +239,6 @@ def _facts(result: RegistrationResult) -> dict[str, str]:
         facts["Expected error"] = f"{result.trust.expected_error:.3g}"
     if result.trust.reasons:
         facts["Note"] = " ".join(result.trust.reasons)
-    facts["Backbone"] = str(report["backbone"])
+    facts["Backbone"] = str(report["backbone"] or "none, the prior of an organ")
     facts["Time"] = f"{report['seconds']:.1f} s"
     return facts

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dine import __version__
+from dine.errors import ConfigError
 from dine.files import file_digest
 from dine.geometry.distance import landmark_errors
 from dine.geometry.surface import Surface
@@ -36,6 +38,9 @@ from dine.registration.types import (
     Trust,
 )
 
+if TYPE_CHECKING:
+    from dine.priors.organ import OrganPrior
+
 
 def register(
     source: Shape,
@@ -51,6 +56,7 @@ def register(
     points: int = POINTS,
     seed: int = 0,
     device: str = "auto",
+    prior: OrganPrior | str | Path | None = None,
 ) -> RegistrationResult:
     """Register a source to a target, of any number of points and in any (the same) units.
 
@@ -75,13 +81,53 @@ def register(
         points: points that the network sees; it was trained with 1024.
         seed: of the draws.
         device: ``auto``, ``cpu`` or ``cuda``.
+        prior: of the organ that ``source`` is the template of, or its file (``dine learn``); it
+            takes the network's place, so model, rounds, surfaces and points cannot be chosen. See
+            :mod:`dine.registration.organ`.
 
     Raises:
         DataError: unreadable or unusable shapes, such as points on a line, or of other sizes.
         ConfigError: unusable settings.
     """
+    if prior is not None:
+        network = {"model": model, "surfaces": not surfaces}
+        network |= {"rounds": rounds != ROUNDS, "points": points != POINTS}
+        _refuse_network(network)
+        return _with_prior(source, target, prior, (prealign, partial, seed), apply or {}, landmarks)
     settings = Settings(prealign, rounds, partial, points, seed, chosen_device(device), surfaces)
     return _registered(source, target, model, settings, apply or {}, landmarks)
+
+
+def _with_prior(
+    source: Shape,
+    target: Shape,
+    prior: OrganPrior | str | Path,
+    settings: tuple[str | np.ndarray, bool, int],
+    apply: Mapping[str, Shape],
+    landmarks: tuple[Points, Points] | None,
+) -> RegistrationResult:
+    """By the prior of an organ; ``settings`` are alignment, partial and seed."""
+    # Nothing else needs these.
+    from dine.priors.organ import OrganPrior, load_organ_prior
+    from dine.registration.organ import OrganSettings, register_organ
+
+    return register_organ(
+        as_surface(source, "source"),
+        as_surface(target, "target"),
+        prior if isinstance(prior, OrganPrior) else load_organ_prior(prior),
+        OrganSettings(*settings),
+        apply={name: as_surface(shape, name) for name, shape in apply.items()},
+        landmarks=landmarks,
+    )
+
+
+def _refuse_network(chosen: Mapping[str, Any]) -> None:
+    names = [name for name, value in chosen.items() if value]
+    if names:
+        raise ConfigError(
+            f"With the prior of an organ there is no network to choose {', '.join(names)} of; "
+            "leave that out."
+        )
 
 
 def _registered(

@@ -15,6 +15,7 @@ from dine.geometry.frame import Frame
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.rigid import Alignment, check_rigid
 from dine.geometry.surface import Surface
+from dine.geometry.voxels import NodeField, Voxels
 from dine.io import announced
 from dine.priors.gaussian import CovarianceRoot
 from dine.registration.surfaces import ProcessField
@@ -22,7 +23,7 @@ from dine.registration.types import Motion, RegistrationResult, Trust
 
 ENDING = "result.npz"
 _FORMAT = 1
-_OPTIONAL = ("uncertainty", "point_uncertainty")
+_OPTIONAL = ("uncertainty", "point_uncertainty", "bound")
 
 
 def write_result(path: Path, result: RegistrationResult) -> None:
@@ -128,6 +129,15 @@ def _field_arrays(field: Callable[[np.ndarray], np.ndarray]) -> dict[str, np.nda
     """What a field is given by; it is told by the names which kind it is."""
     if isinstance(field, FittedDisplacement):
         return {"points": field.points, "displacement": field.displacement}
+    if isinstance(field, NodeField):
+        voxels = field.voxels
+        return {
+            "nodes": voxels.nodes,
+            "cubes": voxels.cubes,
+            "edge": np.array(voxels.edge),
+            "displacement": field.displacement,
+            "rotation": field.rotation,
+        }
     if isinstance(field, ProcessField):
         widths, deviations, affine = field.root.kernel
         return {
@@ -146,6 +156,8 @@ def _field(arrays: dict[str, np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
         raise ValueError("its field holds NaN or infinite numbers")
     if "points" in arrays:
         return FittedDisplacement(arrays["points"], arrays["displacement"])
+    if "nodes" in arrays:
+        return _node_field(**arrays)
     kernel = (arrays["widths"].tolist(), arrays["deviations"].tolist(), float(arrays["affine"]))
     pivots, lower, amplitudes = (arrays[name] for name in ("pivots", "lower", "amplitudes"))
     rank = len(pivots)
@@ -153,6 +165,22 @@ def _field(arrays: dict[str, np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
         raise ValueError("the parts of its field do not fit each other")
     # Its rows at the points that it was fitted at are not needed any more.
     return ProcessField(CovarianceRoot(np.empty((0, rank)), pivots, lower, kernel), amplitudes)
+
+
+def _node_field(
+    nodes: np.ndarray,
+    cubes: np.ndarray,
+    edge: np.ndarray,
+    displacement: np.ndarray,
+    rotation: np.ndarray,
+) -> NodeField:
+    shapes = (nodes.shape[1:], displacement.shape, cubes.shape[1:], edge.shape, rotation.shape)
+    if shapes != ((3,), nodes.shape, (8,), (), (3, 3)) or cubes.dtype.kind != "i" or not len(cubes):
+        raise ValueError("the parts of its field do not fit each other")
+    if not (cubes.min() >= 0 and cubes.max() < len(nodes) and edge > 0):
+        raise ValueError("the cubes of its field name nodes that are not there")
+    voxels = Voxels(nodes, cubes, np.ones(len(cubes)), float(edge))
+    return NodeField(voxels, displacement, rotation)
 
 
 def _result(arrays: dict[str, np.ndarray], about: dict[str, Any]) -> RegistrationResult:
@@ -165,7 +193,8 @@ def _result(arrays: dict[str, np.ndarray], about: dict[str, Any]) -> Registratio
     displacement = moved.vertices - source.vertices
     count = len(arrays["points"])
     shapes = {"points": (count, 3), "point_displacement": (count, 3), "supported": (count,)}
-    shapes |= {"uncertainty": (len(source.vertices),), "point_uncertainty": (count,)}
+    shapes |= {name: (len(source.vertices),) for name in ("uncertainty", "bound")}
+    shapes |= {"point_uncertainty": (count,)}
     for name, shape in shapes.items():
         values = arrays.get(name)
         if values is None and name in _OPTIONAL:
@@ -201,4 +230,5 @@ def _result(arrays: dict[str, np.ndarray], about: dict[str, Any]) -> Registratio
         report,
         alignment=alignment,
         motion=Motion(alignment, field),
+        bound=arrays.get("bound"),
     )

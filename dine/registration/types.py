@@ -193,7 +193,8 @@ class RegistrationResult:
         target: as given.
         moved: the source with its vertices moved, same order and faces.
         displacement: (V, 3) moved minus source vertices; includes the rigid alignment.
-        uncertainty: (V,) expected distance from the true place, or None without calibration.
+        uncertainty: (V,) expected distance from the true place, or None without calibration; with a
+            prior of the organ, the posterior standard deviation.
         applied: moved further points or surfaces, by name.
         points: (n, 3) sampled source points that the network saw, where they are in the source.
         point_displacement: (n, 3) of these.
@@ -203,6 +204,8 @@ class RegistrationResult:
         report: everything that the JSON report says.
         alignment: of the source to the target, and the normalised frame there.
         motion: the field itself, which moves any points.
+        bound: (V,) distance from the true place that 90 % are to stay below; None without a prior
+            of the organ.
     """
 
     source: Surface
@@ -220,6 +223,7 @@ class RegistrationResult:
     _: KW_ONLY
     alignment: Alignment
     motion: Motion
+    bound: np.ndarray | None = None
 
     def __repr__(self) -> str:
         error = self.trust.expected_error

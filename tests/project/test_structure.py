@@ -20,7 +20,7 @@ FLOORS = [
     ("io",),
     ("data",),
     ("models",),
-    ("priors",),
+    ("simulation", "priors"),
     ("refinement",),
     ("training",),
     ("evaluation",),

@@ -1,0 +1,78 @@
+"""Commands for a prior of one's own organ."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import click
+
+from dine import __version__, config
+from dine.cli.options import IN, OUT, seed_option, settings_option
+
+
+@click.command()
+@click.argument("template", type=IN)
+@click.option("-o", "--out", type=OUT, required=True, help="Fields to write (HDF5).")
+@click.option("--fields", "count", type=click.IntRange(2), help="How many; 200 by default.")
+@click.option("--fixed", type=IN, help="Text file of vertices that do not move, numbered from 0.")
+@click.option("--inclusion", type=IN, help="A closed mesh within TEMPLATE that is stiffer.")
+@settings_option(config.Simulation)
+@seed_option
+@click.option("--workers", type=click.IntRange(1), help="Threads; one for each CPU by default.")
+def simulate(template, out, count, fixed, inclusion, settings, seed, workers):
+    """Deform TEMPLATE, a closed mesh of an organ, by finite elements under drawn loads.
+
+    Example: dine simulate liver.ply -o fields.h5
+    """
+    from dine.io.readers import read_surface
+    from dine.simulation.fields import read_vertex_numbers, write_deformations
+    from dine.simulation.simulate import simulate as run
+
+    if count is not None:
+        settings = settings.model_copy(update={"fields": count})
+    surface = read_surface(template)
+    found = run(
+        surface,
+        settings,
+        seed=seed,
+        fixed=fixed and read_vertex_numbers(fixed, len(surface.vertices)),
+        inclusion=inclusion and read_surface(inclusion),
+        workers=workers or os.cpu_count() or 1,
+    )
+    facts = {"seed": seed, "settings": settings.model_dump_json(), "version": __version__}
+    write_deformations(out, found, facts)
+    click.echo(
+        f"{out}: {len(found.vertices)} fields of {len(surface.vertices)} vertices and "
+        f"{len(found.nodes[0])} nodes"
+    )
+
+
+@click.command()
+@click.argument("template", type=IN)
+@click.argument("fields", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=OUT, required=True, help="Prior to write (HDF5).")
+@settings_option(config.OrganLearning)
+@seed_option
+def learn(template, fields, out, settings, seed):
+    """Learn a prior of TEMPLATE, a mesh of an organ, from FIELDS.
+
+    FIELDS are files of `dine simulate`, and folders of meshes that are TEMPLATE deformed.
+
+    Example: dine learn liver.ply fields.h5 -o organ.prior
+    """
+    from dine.io.readers import read_surface
+    from dine.priors.organ_learning import learn as run
+    from dine.simulation.fields import Deformations, deformed_meshes, read_deformations
+
+    surface = read_surface(template)
+    sets: list[Deformations] = [
+        deformed_meshes(path, surface) if path.is_dir() else read_deformations(path)
+        for path in fields
+    ]
+    prior = run(surface, sets, settings, seed=seed)
+    prior.save(out)
+    click.echo(
+        f"{out}: {len(prior.modes)} components of {prior.facts['fields']} fields, and a process of "
+        f"{', '.join(f'{x:.3f}' for x in prior.amplitudes)} radii"
+    )

@@ -1,0 +1,293 @@
+"""Finite elements against what mechanics says, and deformations of an organ from them."""
+
+import h5py
+import numpy as np
+import pytest
+import trimesh
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from dine.cli import cli
+from dine.config import Simulation
+from dine.errors import ConfigError, DataError
+from dine.geometry.surface import Surface
+from dine.geometry.voxels import CORNERS, share_inside, voxelised
+from dine.io.writers import write_surface
+from dine.simulation.elasticity import SoftBody, rotations, unit_stiffness
+from dine.simulation.fields import read_deformations, template_digest, write_deformations
+from dine.simulation.simulate import simulate
+
+pytestmark = pytest.mark.numerical
+
+FEW = Simulation(fields=6, edge=0.25)
+
+
+def ball(radius=1.0, at=(0, 0, 0), subdivisions=3):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return Surface(np.asarray(mesh.vertices) + at, np.asarray(mesh.faces), "ball.ply")
+
+
+def bar(length=8.0):
+    """Two edges wide, with corners on the grid."""
+    mesh = trimesh.creation.box(extents=(length, 2, 2)).subdivide()
+    return Surface(mesh.vertices + np.array([length / 2, 1, 1]), np.asarray(mesh.faces), "bar")
+
+
+def together(*surfaces):
+    offsets = np.cumsum([0, *(len(x.vertices) for x in surfaces)])
+    faces = [x.faces + offset for x, offset in zip(surfaces, offsets, strict=False)]
+    return Surface(np.concatenate([x.vertices for x in surfaces]), np.concatenate(faces), "both")
+
+
+# --- voxels -----------------------------------------------------------------------------------
+
+
+def test_cubes_hold_the_volume_and_all_of_the_surface():
+    found = voxelised(ball(), 0.1)
+    assert found.inside.sum() * 0.1**3 == pytest.approx(4 / 3 * np.pi, rel=0.02)
+    index, weights = found.carried(ball().vertices)
+    assert (weights > -1e-9).all()
+    places = np.einsum("mk,mkc->mc", weights, found.nodes[index])
+    assert np.allclose(places, ball().vertices)
+    assert np.allclose(found.carrier(ball().vertices) @ found.nodes, ball().vertices)
+
+
+def test_a_cavity_and_an_inclusion_are_seen():
+    hollow = ball(0.6)
+    hollow = together(ball(), Surface(hollow.vertices, hollow.faces[:, ::-1]))
+    found = voxelised(hollow, 0.1)
+    assert found.inside.sum() * 0.1**3 == pytest.approx(4 / 3 * np.pi * (1 - 0.6**3), rel=0.03)
+    whole = voxelised(ball(), 0.1)
+    share = share_inside(whole, ball(0.4, at=(0.2, 0, 0)))
+    assert share.sum() * 0.1**3 == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.05)
+    with pytest.raises(DataError, match="does not lie within the organ"):
+        share_inside(whole, ball(0.4, at=(5, 0, 0)))
+
+
+def test_faces_that_look_inwards_make_no_difference():
+    turned = Surface(ball().vertices, ball().faces[:, ::-1])
+    assert np.array_equal(voxelised(turned, 0.2).inside, voxelised(ball(), 0.2).inside)
+
+
+@pytest.mark.parametrize(
+    ("surface", "message"),
+    [
+        (Surface(ball().vertices), "is a cloud of points; expected a closed mesh"),
+        (Surface(ball().vertices, ball().faces[1:]), "is not closed and so has no inside: 3 of"),
+        (together(ball(), ball(at=(0.7, 0.1, 0))), "crosses itself"),
+        (together(ball(), ball(at=(5, 0, 0))), "is in 2 parts that no cube of edge 0.25 joins"),
+    ],
+    ids=["cloud", "open", "crossing", "parts"],
+)
+def test_meshes_without_one_clear_inside_are_refused(surface, message):
+    with pytest.raises(DataError, match=message):
+        voxelised(surface, 0.25)
+
+
+# --- elasticity -------------------------------------------------------------------------------
+
+
+def test_a_cube_resists_strain_and_no_rigid_motion():
+    shear, volume = unit_stiffness()
+    stretch = np.outer(CORNERS[:, 0], [1.0, 0, 0]).ravel()
+    assert stretch @ shear @ stretch == pytest.approx(2)  # 2 μ ε²
+    assert stretch @ volume @ stretch == pytest.approx(1)  # λ tr(ε)²
+    turn = np.cross([0.3, -0.5, 0.2], CORNERS).ravel()
+    assert np.allclose(shear @ turn, 0)
+    assert np.allclose(volume @ turn, 0)
+
+
+def test_rotations_are_those_nearest():
+    turns = Rotation.random(20, random_state=0).as_matrix()
+    stretch = np.random.default_rng(0).normal(size=(20, 3, 3))
+    stretch = 0.1 * (stretch + stretch.swapaxes(1, 2)) + np.eye(3)
+    found = rotations(np.moveaxis(turns @ stretch, 0, 2))
+    assert np.allclose(np.moveaxis(found, 2, 0), turns, atol=1e-6)
+    inside_out = rotations(np.diag([1.0, 1.0, -0.5])[:, :, None])
+    assert np.linalg.det(inside_out[:, :, 0]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("load", [0.02, 1.0])
+def test_a_bar_bends_as_the_elastica_does(load):
+    """A load P across the end of a bar of length L that is held at the other: P L² / E I = 1 lowers
+    the end by 0.3017 L and draws it in by 0.0564 L (Bisshopp and Drucker, 1945); by linear
+    elasticity 0.3333 L and 0. A small one lowers it by P L³ / 3 E I."""
+    length, edge = 12.0, 0.5
+    voxels = voxelised(bar(length), edge)
+    body = SoftBody(voxels, np.ones(len(voxels.cubes)), 0.3, voxels.nodes[:, 0] <= edge / 2)
+    across = np.mgrid[0.2:1.8:4j, 0.2:1.8:4j].reshape(2, -1)
+    end = np.asarray(
+        voxels.carrier(np.column_stack([np.full(16, length), *across])).mean(axis=0)
+    ).ravel()
+    force = load * (2 * 2**3 / 12) / length**2
+    forces = np.zeros((len(voxels.nodes), 3, 1))
+    forces[:, 2, 0] = end * force / edge**2
+    moved, reached = body.equilibrium(forces, np.zeros((len(voxels.cubes), 1)))
+    drawn, _, lowered = end @ moved[:, :, 0] * edge / length
+    assert reached.all()
+    assert body.inverted(moved) == 0
+    if load == 1.0:
+        assert lowered == pytest.approx(0.3017, rel=0.07)
+        assert -drawn == pytest.approx(0.0564, rel=0.15)
+    else:
+        assert lowered == pytest.approx(load / 3, rel=0.08)
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.45])
+def test_a_stretched_bar_grows_longer_as_it_should(poisson):
+    """Growth of all cubes is the only strain: no force, and every length grows alike."""
+    voxels = voxelised(bar(4.0), 0.5)
+    fixed = np.zeros(len(voxels.nodes), bool)
+    fixed[voxels.cubes[0]] = True
+    body = SoftBody(voxels, np.ones(len(voxels.cubes)), poisson, fixed)
+    growth = np.full((len(voxels.cubes), 1), 0.02)
+    moved, reached = body.equilibrium(np.zeros((*voxels.nodes.shape, 1)), growth)
+    assert reached.all()
+    far = voxels.nodes[:, 0] > 2
+    extent = np.ptp(voxels.nodes[far], axis=0)
+    assert np.ptp(voxels.nodes[far] + 0.5 * moved[far, :, 0], axis=0) == pytest.approx(
+        1.02 * extent, rel=2e-3
+    )
+
+
+# --- an organ ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fields():
+    return simulate(ball(), FEW, seed=3)
+
+
+def test_fields_do_not_depend_on_workers_or_on_how_many_there_are(fields):
+    fewer = simulate(ball(), FEW.model_copy(update={"fields": 5}), seed=3, workers=2)
+    assert np.array_equal(fewer.vertices, fields.vertices[:5])
+    assert np.array_equal(fewer.nodes, fields.nodes[:5])
+    other = simulate(ball(), FEW.model_copy(update={"fields": 2}), seed=4)
+    assert not np.allclose(other.vertices, fields.vertices[:2])
+
+
+def test_fields_move_the_surface_as_its_inside(fields):
+    index, weights = fields.voxels.carried(ball().vertices)
+    expected = np.einsum("mk,fmkc->fmc", weights, fields.nodes[:, index])
+    assert np.allclose(fields.vertices, expected, atol=1e-5)
+    mean = np.linalg.norm(fields.vertices, axis=2).mean(axis=1)
+    assert ((mean > 0.001) & (mean < 0.4)).all()
+    assert len(np.unique(mean.round(6))) == len(mean)
+
+
+def test_units_and_place_make_no_difference(fields):
+    moved = Surface(25.4 * ball().vertices + [100, -50, 3], ball().faces)
+    found = simulate(moved, FEW.model_copy(update={"fields": 2}), seed=3)
+    assert np.allclose(found.vertices / 25.4, fields.vertices[:2], atol=1e-3)
+
+
+def test_fixed_vertices_stay(fields):
+    fixed = ball().vertices[:, 2] < -0.5
+    found = simulate(ball(), FEW, seed=3, fixed=fixed)
+    assert np.abs(found.vertices[:, fixed]).max() == 0
+    assert np.abs(found.vertices).max() > 0.05
+
+
+def test_a_stiff_inclusion_is_strained_less():
+    settings = FEW.model_copy(update={"loads": ["force"], "inclusion": [100.0, 100.0]})
+    inclusion = ball(0.4, at=(0.3, 0, 0))
+    fixed = ball().vertices[:, 2] < -0.8
+    strains = []
+    for within in (None, inclusion):
+        found = simulate(ball(), settings, seed=1, fixed=fixed, inclusion=within)
+        places = inclusion.vertices * 0.9 + [0.03, 0, 0]
+        index, weights = found.voxels.carried(places)
+        moved = places + np.einsum("mk,fmkc->fmc", weights, found.nodes[:, index])
+        spread = moved - moved.mean(axis=1, keepdims=True)
+        singular = np.linalg.svd(spread, compute_uv=False)
+        strains.append(np.std(singular / singular.mean(axis=1, keepdims=True)))
+    assert strains[1] < 0.5 * strains[0]
+
+
+def test_finer_cubes_change_the_fields_little():
+    """The same loads at other resolutions: differences shrink with the edge."""
+    found = {
+        edge: simulate(ball(), Simulation(fields=4, edge=edge, amplitude=[0.05, 0.1]), seed=2)
+        for edge in (0.5, 0.3, 0.15)
+    }
+    size = np.abs(found[0.15].vertices).mean()
+    apart = [
+        np.abs(found[edge].vertices - found[0.15].vertices).mean() / size for edge in (0.5, 0.3)
+    ]
+    assert apart[1] < apart[0]
+    assert apart[1] < 0.3
+
+
+def test_patches_that_fix_everything_are_refused():
+    with pytest.raises(ConfigError, match="fix all of the surface; lower `patch`"):
+        simulate(ball(), FEW.model_copy(update={"patch": [3.0, 3.0]}))
+
+
+# --- files and the command --------------------------------------------------------------------
+
+
+def run(*words):
+    return CliRunner().invoke(cli, ["simulate", *map(str, words)])
+
+
+def test_the_command_writes_what_is_read_back(tmp_path):
+    template = tmp_path / "ball.ply"
+    write_surface(template, ball())
+    out = tmp_path / "fields.h5"
+    settings = '{"edge": 0.3}'
+    done = run(template, "-o", out, "--fields", 3, "--settings", settings, "--seed", 7)
+    assert done.exit_code == 0, done.exception
+    found = read_deformations(out)
+    assert template_digest(found.template) == template_digest(ball())
+    assert np.array_equal(found.template.faces, ball().faces)
+    expected = simulate(ball(), Simulation(fields=3, edge=0.3), seed=7)
+    assert np.array_equal(found.vertices, expected.vertices)
+    assert np.array_equal(found.nodes, expected.nodes)
+    assert np.array_equal(found.voxels.cubes, expected.voxels.cubes)
+    assert found.voxels.edge == expected.voxels.edge
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "fixes no vertex"),
+        ("0 1 2\nthree", "not a readable text file of vertex numbers"),
+        ("0, 1, 642", "names vertices from 0 to 642, but the template has 642"),
+        ("-1 3", "names vertices from -1 to 3"),
+        (" ".join(map(str, range(642))), "fixes all 642 vertices"),
+        (None, "not a readable text file"),
+    ],
+)
+def test_unusable_files_of_fixed_vertices(tmp_path, text, message):
+    write_surface(tmp_path / "ball.ply", ball())
+    if text is not None:
+        (tmp_path / "fixed.txt").write_text(text)
+    out = tmp_path / "fields.h5"
+    done = run(tmp_path / "ball.ply", "-o", out, "--fixed", tmp_path / "fixed.txt")
+    assert isinstance(done.exception, DataError)
+    assert message in str(done.exception)
+    assert not out.exists()
+
+
+def test_settings_that_go_down_are_refused(tmp_path):
+    write_surface(tmp_path / "ball.ply", ball())
+    settings = '{"poisson": [0.45, 0.3]}'
+    done = run(tmp_path / "ball.ply", "-o", tmp_path / "f.h5", "--settings", settings)
+    assert isinstance(done.exception, ConfigError)
+    assert "`poisson` goes from 0.45 down to 0.3" in str(done.exception)
+
+
+def test_files_of_fields_that_do_not_fit_their_mesh(tmp_path, fields):
+    path = tmp_path / "fields.h5"
+    write_deformations(path, fields, {})
+    for change, message in (
+        (lambda file: file["template/vertices"].write_direct(np.ones((642, 3))), "digest"),
+        (lambda file: file["voxels/cubes"].write_direct(file["voxels/cubes"][()] + 10**6), "cubes"),
+        (lambda file: file.pop("nodes"), "nodes"),
+        (lambda file: file.attrs.pop("template"), "template"),
+    ):
+        write_deformations(path, fields, {})
+        with h5py.File(path, "r+") as file:
+            change(file)
+        with pytest.raises(DataError, match=message):
+            read_deformations(path)
