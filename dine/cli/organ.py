@@ -8,19 +8,33 @@ from pathlib import Path
 import click
 
 from dine import __version__, config
-from dine.cli.options import IN, OUT, seed_option, settings_option
+from dine.cli.options import IN, OUT, gathered, seed_option, settings_option
+
+
+def _simulation(fields: int | None, settings: config.Simulation) -> config.Simulation:
+    return settings if fields is None else settings.model_copy(update={"fields": fields})
 
 
 @click.command()
 @click.argument("template", type=IN)
 @click.option("-o", "--out", type=OUT, required=True, help="Fields to write (HDF5).")
-@click.option("--fields", "count", type=click.IntRange(2), help="How many; 200 by default.")
-@click.option("--fixed", type=IN, help="Text file of vertices that do not move, numbered from 0.")
-@click.option("--inclusion", type=IN, help="A closed mesh within TEMPLATE that is stiffer.")
-@settings_option(config.Simulation)
+@gathered(
+    "known",
+    dict,
+    click.option(
+        "--fixed", type=IN, help="Text file of vertices that do not move, numbered from 0."
+    ),
+    click.option("--inclusion", type=IN, help="A closed mesh within TEMPLATE that is stiffer."),
+)
+@gathered(
+    "settings",
+    _simulation,
+    click.option("--fields", type=click.IntRange(2), help="How many; 200 by default."),
+    settings_option(config.Simulation),
+)
 @seed_option
 @click.option("--workers", type=click.IntRange(1), help="Threads; one for each CPU by default.")
-def simulate(template, out, count, fixed, inclusion, settings, seed, workers):
+def simulate(template, out, known, settings, seed, workers):
     """Deform TEMPLATE, a closed mesh of an organ, by finite elements under drawn loads.
 
     Example: dine simulate liver.ply -o fields.h5
@@ -29,9 +43,8 @@ def simulate(template, out, count, fixed, inclusion, settings, seed, workers):
     from dine.simulation.fields import read_vertex_numbers, write_deformations
     from dine.simulation.simulate import simulate as run
 
-    if count is not None:
-        settings = settings.model_copy(update={"fields": count})
     surface = read_surface(template)
+    fixed, inclusion = known["fixed"], known["inclusion"]
     found = run(
         surface,
         settings,

@@ -158,7 +158,7 @@ def voxelised(surface: Surface, edge: float) -> Voxels:
             f"{surface.name} would take {' × '.join(map(str, shape))} cubes; expected a larger "
             "edge."
         )
-    low = mesh.vertices.min(axis=0) - edge + edge / _FINER * np.array(_ASIDE)
+    low = np.asarray(mesh.bounds[0]) - edge + edge / _FINER * np.array(_ASIDE)
     share = _shares(mesh, low, edge, shape, surface.name)
     touched = np.zeros(shape, bool)
     dense, _ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, edge / 3, max_iter=30)

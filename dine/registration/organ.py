@@ -284,9 +284,40 @@ def register_organ(
     field, search = organ_field(
         prior, target, matrices, loose=loose, partial=settings.partial, seed=settings.seed
     )
-    alignment = field.placed.alignment
+    report = {"settings": settings.described()}
+    result = _result(field, search, source, target, report)
+    trust = _trust(field, report, notes, float(result.uncertainty.mean()))
+    report["trust"] = {
+        "verdict": trust.verdict,
+        "reasons": list(trust.reasons),
+        "percentiles": trust.percentiles,
+        "expected_error": trust.expected_error,
+    }
+    report["applied"] = {}
+    for name, surface in apply.items():
+        bound = field.placed.alignment.frame.scale * field.bounds(surface.vertices)[1]
+        moved = result.motion.surface(surface)
+        result.applied[name] = replace(moved, data={**surface.data, BOUND_NAME: bound})
+        report["applied"][name] = {BOUND_NAME: _summary(bound)}
+    if marks is not None:
+        here, there = marks
+        after = landmark_errors(result.motion(here), there)
+        before = landmark_errors(here, there)
+        report["landmarks"] = {"count": len(here), "before": before, "after": after}
+    report["seconds"] = time.perf_counter() - began
+    return replace(result, trust=trust)
+
+
+def _result(
+    field: OrganField,
+    search: _Search,
+    source: Surface,
+    target: Surface,
+    report: dict[str, Any],
+) -> RegistrationResult:
+    """The moved template with bounds; what is said of it goes into the report."""
+    prior, alignment = field.placed.prior, field.placed.alignment
     scale = alignment.frame.scale
-    motion = Motion(alignment, field.anywhere())
     vertices = alignment.normalise(source.vertices)
     moved = replace(
         source, vertices=alignment.restore(vertices + field.at(prior.at_vertices(), vertices))
@@ -297,46 +328,27 @@ def register_organ(
     known = deviation_and_bound(field.covariance(search.carrier, places))
     near, weights = _nearest(places, vertices)
     deviation, bound = (scale * (x[near] * weights).sum(axis=1) for x in known)
-    applied, bounds = {}, {}
-    for name, surface in apply.items():
-        bounds[name] = scale * field.bounds(surface.vertices)[1]
-        data = {**surface.data, BOUND_NAME: bounds[name]}
-        applied[name] = replace(motion.surface(surface), data=data)
-    report = _report(field, search, source, target, moved)
-    trust = _trust(field, report, notes, float(deviation.mean()))
+    report |= _report(field, search, source, target, moved)
     report |= {
-        "settings": settings.described(),
         "supported": float(shown.mean()),
         "uncertainty": _summary(deviation),
         BOUND_NAME: _summary(bound),
-        "applied": {name: {BOUND_NAME: _summary(x)} for name, x in bounds.items()},
-        "trust": {
-            "verdict": trust.verdict,
-            "reasons": list(trust.reasons),
-            "percentiles": {},
-            "expected_error": trust.expected_error,
-        },
     }
-    if marks is not None:
-        here, there = marks
-        before, after = landmark_errors(here, there), landmark_errors(motion(here), there)
-        report["landmarks"] = {"count": len(here), "before": before, "after": after}
-    report["seconds"] = time.perf_counter() - began
     return RegistrationResult(
         source,
         target,
         moved,
         moved.vertices - source.vertices,
         deviation,
-        applied,
+        {},
         search.places,
         alignment.restore(moved_points) - search.places,
         scale * known[0],
         shown,
-        trust,
+        Trust(GOOD, (), {}, None),
         report,
         alignment=alignment,
-        motion=motion,
+        motion=Motion(alignment, field.anywhere()),
         bound=bound,
     )
 

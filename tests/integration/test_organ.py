@@ -172,13 +172,21 @@ def test_bounds_hold_as_often_as_they_say():
     assert np.allclose((lengths <= bound).mean(axis=0), 0.9, atol=0.02)
 
 
-def test_what_is_determined_is_counted():
+def test_covariances_are_those_of_the_joint_gaussian():
+    """Against the formula with all 27 coordinates at once."""
     rng = np.random.default_rng(0)
-    prior = LinearGaussian(np.zeros((9, 3)), rng.normal(size=(4, 9, 3)), np.zeros((9, 0)))
-    precision = np.zeros((9, 3, 3))
-    assert Posterior(prior, np.zeros((9, 3)), precision).determined == pytest.approx(0)
-    precision[:] = 1e8 * np.eye(3)
-    assert Posterior(prior, np.zeros((9, 3)), precision).determined == pytest.approx(4, abs=1e-3)
+    modes, kernel = rng.normal(size=(4, 9, 3)), rng.normal(size=(9, 2))
+    half = rng.normal(size=(9, 3, 3))
+    precision = half @ half.swapaxes(1, 2)
+    posterior = Posterior(LinearGaussian(np.zeros((9, 3)), modes, kernel), half[:, 0], precision)
+    before = modes.reshape(4, -1).T @ modes.reshape(4, -1) + np.kron(kernel @ kernel.T, np.eye(3))
+    seen = np.zeros((27, 27))
+    for point in range(9):
+        rows = slice(3 * point, 3 * point + 3)
+        seen[rows, rows] = precision[point]
+    after = np.linalg.inv(np.linalg.inv(before + 1e-9 * np.eye(27)) + seen)
+    expected = np.stack([after[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(9)])
+    assert np.allclose(posterior.covariance(kernel, modes), expected, atol=1e-5)
 
 
 # --- registering ------------------------------------------------------------------------------
@@ -214,7 +222,7 @@ def test_hidden_places_follow_what_is_seen(prior, known):
     assert (result.bound >= result.uncertainty).all()
     assert result.uncertainty[hidden].mean() > result.uncertainty[used].mean()
     assert result.applied["tumour"].vertices.shape == deep.vertices.shape
-    assert (result.applied_bounds["tumour"] > 0).all()
+    assert (result.applied["tumour"].data["bound_90"] > 0).all()
     expected = deep.vertices + ways(deep.vertices, [8.0, -5.0, 4.0])
     expected = expected if known else placed(expected)
     moved = np.linalg.norm(result.applied["tumour"].vertices - expected, axis=1)
@@ -245,7 +253,7 @@ def test_what_a_prior_of_an_organ_cannot_register(prior):
     with pytest.raises(DataError, match="far shows hardly anything of organ"):
         dine.register(organ(), far, prior=prior, partial=True, prealign="off")
     with pytest.raises(ConfigError, match="no network to choose surfaces of"):
-        dine.register(organ(), scan, prior=prior, surfaces=True)
+        dine.register(organ(), scan, prior=prior, surfaces=False)
 
 
 # --- commands ---------------------------------------------------------------------------------
