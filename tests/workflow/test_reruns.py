@@ -227,7 +227,9 @@ def test_the_digest_of_a_step_covers_all_that_it_runs(undisturbed, monkeypatch, 
         for name in map(Path, trace["ran"]):
             own = name.is_relative_to(undisturbed.place.folder / "code")
             if name.is_relative_to(ROOT / "dine"):
-                own = name.relative_to(ROOT / "dine").with_suffix("").as_posix() not in neutral
+                module = name.relative_to(ROOT / "dine").with_suffix("")
+                # Of commands, the body of the step's own counts.
+                own = module.parts[0] != "cli" and module.as_posix() not in neutral
             assert not own or name in covered, f"{step} runs {name}"
         seen.add(step)
     assert {*CLASSES, "raw", "pairs", "agreement", "corrupt", "evaluate", "report"} <= seen
