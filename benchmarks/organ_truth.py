@@ -18,8 +18,8 @@ from dine.geometry.voxels import CORNERS, voxelised
 POISSON = (0.3, 0.38)
 AMPLITUDE = (0.08, 0.2)
 EDGE = 0.125
-# Radius of what the simulations hold; of what is held in truth, and how far from there.
-PATCH, HELD, SHIFTED = 0.35, (0.2, 0.5), 0.25
+# How far from a given vertex the middle of what is held may be, and how large that is.
+SHIFTED, HELD = 0.25, (0.2, 0.5)
 WIDTHS = (0.6, 1.2)
 _GAUSS = 0.5 + (CORNERS - 0.5) / np.sqrt(3)
 _STEP, _ITERATIONS, _TOLERANCE, _MOST_STEPS = 0.15, 12, 1e-6, 60

@@ -311,10 +311,13 @@ class Simulation(Section):
         list[Annotated[Positive, Field(lt=0.5)]], Field(min_length=2, max_length=2)
     ] = [0.4, 0.48]
     """Poisson ratio."""
+    fixed: Literal["exactly", "about"] = "exactly"
+    """Whether given vertices are fixed as they are, or a patch with its middle at one of them, as
+    where an organ hangs is seldom known exactly."""
     patches: Count = 2
     """Largest number of patches of the surface that are fixed, where none are given."""
     patch: Range = [0.2, 0.5]
-    """Radius of such a patch."""
+    """Radius of a patch."""
     loads: list[Load] = Field(
         default=["force", "force", "gravity", "gravity", "pressure", "shrinkage"], min_length=1
     )
@@ -353,7 +356,7 @@ class OrganLearning(Section):
     """Edge of the cubes inside, where no simulation comes with some."""
     widths: list[Positive] = Field(default=[0.3, 0.6, 1.2], min_length=1)
     """Widths of the process for what the components miss; its amplitudes are fitted."""
-    mismatch: list[NonNegative] = [0.02, 0.0, 0.0]
+    mismatch: list[NonNegative] = [0.01, 0.0, 0.0]
     """Amplitudes at these widths of what the fields themselves are wrong about, on top."""
 
     @model_validator(mode="after")

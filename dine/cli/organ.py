@@ -76,10 +76,10 @@ def learn(template, fields, out, settings, seed):
     """
     from dine.io.readers import read_surface
     from dine.priors.organ_learning import learn as run
-    from dine.simulation.fields import Deformations, deformed_meshes, read_deformations
+    from dine.simulation.fields import OrganDeformations, deformed_meshes, read_deformations
 
     surface = read_surface(template)
-    sets: list[Deformations] = [
+    sets: list[OrganDeformations] = [
         deformed_meshes(path, surface) if path.is_dir() else read_deformations(path)
         for path in fields
     ]

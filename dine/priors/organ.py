@@ -91,7 +91,7 @@ class OrganPrior:
     def at(self, carrier: csr_matrix) -> tuple[np.ndarray, np.ndarray]:
         """Mean (N, 3) and modes (R, N, 3) at some places."""
         flat = carrier @ self.modes.swapaxes(0, 1).reshape(len(self.mean), -1)
-        modes = flat.reshape(-1, len(self.modes), 3).swapaxes(0, 1)
+        modes = flat.reshape(carrier.shape[0], len(self.modes), 3).swapaxes(0, 1)
         return carrier @ self.mean, np.ascontiguousarray(modes)
 
     def save(self, path: str | os.PathLike) -> None:

@@ -25,13 +25,13 @@ from dine.priors.gaussian import squared_exponential
 from dine.priors.gaussian_process import GaussianProcessPrior
 from dine.priors.organ import OrganPrior
 from dine.simulation.elasticity import filled
-from dine.simulation.fields import Deformations, template_digest
+from dine.simulation.fields import OrganDeformations, template_digest
 
 log = logging.getLogger(__name__)
 
 
 def learn(
-    template: Surface, sets: Sequence[Deformations], settings: OrganLearning, *, seed: int = 0
+    template: Surface, sets: Sequence[OrganDeformations], settings: OrganLearning, *, seed: int = 0
 ) -> OrganPrior:
     """The prior of a template from its deformations.
 
@@ -92,7 +92,7 @@ def components(fields: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def _joined(
-    template: Surface, sets: Sequence[Deformations], edge: float
+    template: Surface, sets: Sequence[OrganDeformations], edge: float
 ) -> tuple[Voxels | None, np.ndarray]:
     """Cubes in the template, and all fields (K, V + n, 3) in its units.
 
@@ -114,7 +114,7 @@ def _joined(
     return voxels, np.concatenate([_with_inside(one, voxels) for one in sets])
 
 
-def _with_inside(fields: Deformations, voxels: Voxels | None) -> np.ndarray:
+def _with_inside(fields: OrganDeformations, voxels: Voxels | None) -> np.ndarray:
     """(K, V + n, 3); where nothing is known at these nodes, those of least elastic energy."""
     vertices = fields.vertices.astype(np.float64)
     if voxels is None:

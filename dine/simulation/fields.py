@@ -23,7 +23,7 @@ FORMAT = "dine-deformations"
 
 
 @dataclass(frozen=True)
-class Deformations:
+class OrganDeformations:
     """K displacement fields of a template, in its units.
 
     Attributes:
@@ -100,7 +100,7 @@ def get_indices(group: h5py.Group, name: str, columns: int, below: int) -> np.nd
 
 
 def write_deformations(
-    path: str | os.PathLike, fields: Deformations, facts: Mapping[str, str | int]
+    path: str | os.PathLike, fields: OrganDeformations, facts: Mapping[str, str | int]
 ) -> None:
     """Write the fields atomically, with facts on how they were made."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
@@ -114,7 +114,7 @@ def write_deformations(
                 )
 
 
-def read_deformations(path: str | os.PathLike) -> Deformations:
+def read_deformations(path: str | os.PathLike) -> OrganDeformations:
     """Fields of a template.
 
     Raises:
@@ -124,12 +124,12 @@ def read_deformations(path: str | os.PathLike) -> Deformations:
         surface, voxels = get_template(file)
         vertices = get_numbers(file, "vertices", (None, len(surface.vertices), 3))
         if voxels is None:
-            return Deformations(surface, vertices)
+            return OrganDeformations(surface, vertices)
         nodes = get_numbers(file, "nodes", (len(vertices), len(voxels.nodes), 3))
-        return Deformations(surface, vertices, voxels, nodes)
+        return OrganDeformations(surface, vertices, voxels, nodes)
 
 
-def deformed_meshes(folder: str | os.PathLike, template: Surface) -> Deformations:
+def deformed_meshes(folder: str | os.PathLike, template: Surface) -> OrganDeformations:
     """The fields of all meshes in a folder, which are the template with its vertices moved.
 
     Raises:
@@ -148,7 +148,7 @@ def deformed_meshes(folder: str | os.PathLike, template: Surface) -> Deformation
                 "deformed."
             )
         found[row] = mesh.vertices - template.vertices
-    return Deformations(template, found)
+    return OrganDeformations(template, found)
 
 
 def read_vertex_numbers(path: str | os.PathLike, count: int) -> np.ndarray:

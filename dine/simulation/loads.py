@@ -62,16 +62,23 @@ class Organ:
         return found
 
 
-def drawn_patches(organ: Organ, settings: Simulation, rng: np.random.Generator) -> np.ndarray:
-    """Mask (V,) of the vertices in some round patches of the surface.
+def drawn_patches(
+    organ: Organ, settings: Simulation, rng: np.random.Generator, about: np.ndarray | None
+) -> np.ndarray:
+    """Mask (V,) of the vertices in some round patches of the surface; in one with its middle at
+    one of the vertices ``about``, a mask (V,), where these are given.
 
     Raises:
         ConfigError: nothing would be left to move.
     """
     vertices = organ.surface.vertices
     fixed = np.zeros(len(vertices), bool)
-    for _ in range(rng.integers(settings.patches) + 1):
-        distance = np.linalg.norm(vertices - organ.place(rng), axis=1)
+    if about is None:
+        middles = [organ.place(rng) for _ in range(rng.integers(settings.patches) + 1)]
+    else:
+        middles = [vertices[rng.choice(np.flatnonzero(about))]]
+    for middle in middles:
+        distance = np.linalg.norm(vertices - middle, axis=1)
         fixed |= distance <= max(rng.uniform(*settings.patch), distance.min())
     if fixed.all():
         raise ConfigError(
@@ -87,7 +94,7 @@ def drawn_body(
     fixed: np.ndarray | None,
     inclusion: np.ndarray | None,
 ) -> SoftBody:
-    """An organ as a body of drawn stiffness, held at ``fixed`` vertices (V,) or drawn patches.
+    """An organ as a body of drawn stiffness, held at ``fixed`` vertices (V,) or in drawn patches.
 
     ``inclusion`` (E,) is the share of each cube that lies in a stiffer part.
     """
@@ -95,8 +102,8 @@ def drawn_body(
     places = np.stack([organ.place(rng) for _ in range(_PLACES)])
     signs = rng.normal(size=_PLACES)
     harder = _between(settings.inclusion, rng.random())
-    if fixed is None:
-        fixed = drawn_patches(organ, settings, rng)
+    if fixed is None or settings.fixed == "about":
+        fixed = drawn_patches(organ, settings, rng, fixed)
     near = _bump(organ.voxels.middles[:, None], places, _ALIKE) @ signs
     stiffness = _between(settings.stiffness, 0.5 + 0.5 * np.tanh(near))
     if inclusion is not None:

@@ -15,7 +15,7 @@ from dine.geometry.surface import Surface
 from dine.geometry.voxels import Voxels, share_inside, voxelised
 from dine.progress import Progress
 from dine.simulation.elasticity import SoftBody
-from dine.simulation.fields import Deformations
+from dine.simulation.fields import OrganDeformations
 from dine.simulation.loads import Organ, drawn_body, drawn_loads
 
 # What random numbers are drawn for, beside the seed and a number.
@@ -34,7 +34,7 @@ def simulate(
     fixed: np.ndarray | None = None,
     inclusion: Surface | None = None,
     workers: int = 1,
-) -> Deformations:
+) -> OrganDeformations:
     """Deform a closed mesh by drawn loads, with drawn stiffness and held at drawn places.
 
     Field i depends on the seed, the settings and i alone: neither on the workers nor on how many
@@ -85,7 +85,7 @@ def simulate(
     restored = Voxels(
         frame.restore(voxels.nodes), voxels.cubes, voxels.inside, voxels.edge * frame.scale
     )
-    return Deformations(surface, vertices, restored, nodes)
+    return OrganDeformations(surface, vertices, restored, nodes)
 
 
 def _deformed(
@@ -102,8 +102,10 @@ def _deformed(
     found = np.zeros_like(forces)
     left = np.arange(len(rows))
     for attempt in range(_TRIES):
-        less = _LESS**attempt
-        moved, reached = body.equilibrium(less * forces[:, :, left], less * growth[:, left])
+        pull, grow = (_LESS**attempt * x[..., left] for x in (forces, growth))
+        moved, reached = body.equilibrium(pull, grow)
+        if attempt == _TRIES - 1:  # so small that rotations do not matter
+            moved, reached = body.linear(pull + body.of_growth(grow)), np.ones(len(left), bool)
         good = reached & (body.inverted(moved) == 0)
         found[:, :, left[good]] = moved[:, :, good]
         left = left[~good]

@@ -48,12 +48,16 @@ from dine.io.writers import write_moved, write_surface
 from dine.models.checkpoint import load_backbone, save_backbone
 from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior
+from dine.priors.organ import load_organ_prior
+from dine.priors.organ_learning import learn
 from dine.refinement.process import SURFACE
 from dine.registration.calibration import Calibration, load_calibration
 from dine.registration.many import read_jobs
 from dine.registration.saved import load_result, write_result
 from dine.registration.surfaces import ProcessField
 from dine.registration.types import Motion, RegistrationResult, Trust
+from dine.simulation.fields import OrganDeformations, read_deformations, write_deformations
+from dine.simulation.simulate import simulate
 from dine.training.stage2 import selected_lambda
 from dine.training.stages import new_backbone
 from fuzz import mutations as m
@@ -510,6 +514,51 @@ def prior(path: Path) -> None:
     assert isinstance(found.shape.get("points", 16), int)
 
 
+@functools.cache
+def sample_deformations() -> OrganDeformations:
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    template = Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return simulate(template, config.Simulation(fields=6, edge=0.6))
+
+
+def deformation_files() -> list[bytes]:
+    found = sample_deformations()
+    facts = {"seed": 0}
+    return [
+        written(lambda path: write_deformations(path, found, facts), ".h5"),
+        written(
+            lambda path: write_deformations(
+                path, OrganDeformations(found.template, found.vertices), facts
+            ),
+            ".h5",
+        ),
+    ]
+
+
+def deformations(path: Path) -> None:
+    found = read_deformations(path)
+    assert found.vertices.shape[1:] == found.template.vertices.shape
+    assert np.isfinite(found.vertices).all()
+    if found.voxels is not None:
+        assert found.nodes.shape == (len(found.vertices), *found.voxels.nodes.shape)
+        assert np.isfinite(found.voxels.carrier(found.template.vertices).data).all()
+
+
+def organ_priors() -> list[bytes]:
+    found = sample_deformations()
+    settings = config.OrganLearning(candidates=[2], points=20)
+    return [written(learn(found.template, [found], settings).save, ".prior")]
+
+
+def organ_prior(path: Path) -> None:
+    found = load_organ_prior(path)
+    mean, modes = found.at(found.at_vertices())
+    assert mean.shape == found.template.vertices.shape
+    assert modes.shape[1:] == mean.shape
+    assert np.isfinite(modes).all()
+    assert isinstance(found.facts, dict)
+
+
 def calibrations() -> list[bytes]:
     reference = {
         name: sorted(np.random.default_rng(0).random(5).tolist())
@@ -834,6 +883,8 @@ TARGETS: dict[str, Target] = {
     "backbone": Target("model.safetensors", weights, TENSORS, backbone),
     "published": Target("model.pth", published, m.BYTES, backbone, 0.5),
     "prior": Target("prior.safetensors", priors, TENSORS, prior, 2),
+    "deformations": Target("fields.h5", deformation_files, HDF5, deformations),
+    "organ_prior": Target("organ.prior", organ_priors, HDF5, organ_prior),
     "calibration": Target("c.json", calibrations, m.JSON, calibration),
     "state": Target("state.pt", states, m.BYTES, state),
     "config": Target(

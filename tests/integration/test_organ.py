@@ -18,7 +18,7 @@ from dine.priors.gaussian import LinearGaussian, Posterior
 from dine.priors.organ import load_organ_prior
 from dine.priors.organ_learning import components, learn
 from dine.registration.organ import deviation_and_bound
-from dine.simulation.fields import Deformations, write_deformations
+from dine.simulation.fields import OrganDeformations, write_deformations
 from dine.simulation.simulate import simulate
 
 pytestmark = pytest.mark.numerical
@@ -38,7 +38,7 @@ def organ():
 
 
 def family(count, seed, amplitude=6.0):
-    """Deformations (K, V, 3) in three ways, of random sizes, and those of its inside."""
+    """OrganDeformations (K, V, 3) in three ways, of random sizes, and those of its inside."""
     rng = np.random.default_rng(seed)
     size = amplitude * rng.normal(size=(count, 3))
     return np.stack([ways(organ().vertices, row) for row in size])
@@ -55,7 +55,7 @@ def ways(points, size):
 @pytest.fixture(scope="module")
 def prior():
     fields = family(30, 0).astype(np.float32)
-    return learn(organ(), [Deformations(organ(), fields)], SETTINGS)
+    return learn(organ(), [OrganDeformations(organ(), fields)], SETTINGS)
 
 
 def half(vertices):
@@ -102,7 +102,7 @@ def test_the_inside_goes_with_the_surface(prior):
 
 def test_simulated_and_real_deformations_go_together():
     simulated = simulate(organ(), Simulation(fields=6, edge=0.3))
-    real = Deformations(organ(), family(6, 1).astype(np.float32))
+    real = OrganDeformations(organ(), family(6, 1).astype(np.float32))
     found = learn(organ(), [real, simulated], SETTINGS)
     assert found.facts["fields"] == 12
     assert len(found.mean) == len(organ().vertices) + len(simulated.voxels.nodes)
@@ -119,12 +119,12 @@ def test_simulated_and_real_deformations_go_together():
 def test_what_cannot_be_learned_from(fields, settings, error, message):
     settings = SETTINGS.model_copy(update=settings)
     with pytest.raises(error, match=message):
-        learn(organ(), [Deformations(organ(), fields.astype(np.float32))], settings)
+        learn(organ(), [OrganDeformations(organ(), fields.astype(np.float32))], settings)
 
 
 def test_deformations_of_another_mesh_are_refused():
     other = Surface(organ().vertices * 1.01, organ().faces, "other")
-    fields = Deformations(other, family(6, 0).astype(np.float32))
+    fields = OrganDeformations(other, family(6, 0).astype(np.float32))
     with pytest.raises(DataError, match="other holds deformations of another mesh than organ"):
         learn(organ(), [fields], SETTINGS)
 
@@ -313,6 +313,6 @@ def test_a_folder_of_other_meshes_is_refused(tmp_path):
 
 def test_the_file_of_fields_is_no_prior(tmp_path):
     path = tmp_path / "fields.h5"
-    write_deformations(path, Deformations(organ(), family(3, 0).astype(np.float32)), {})
+    write_deformations(path, OrganDeformations(organ(), family(3, 0).astype(np.float32)), {})
     with pytest.raises(DataError, match="is of another kind than dine-organ-prior"):
         load_organ_prior(path)

@@ -188,6 +188,17 @@ def test_fixed_vertices_stay(fields):
     assert np.abs(found.vertices).max() > 0.05
 
 
+def test_what_is_fixed_about_some_vertices_lies_near_them():
+    vertices = ball().vertices
+    about = vertices[:, 2] > 0.95
+    settings = FEW.model_copy(update={"fixed": "about", "shared": 1, "patch": [0.3, 0.5]})
+    still = np.linalg.norm(simulate(ball(), settings, seed=3, fixed=about).vertices, axis=2) == 0
+    assert still.any(axis=1).all()
+    far = np.linalg.norm(vertices - [0, 0, 1], axis=1) > 0.32 + 0.5 + 0.1
+    assert not still[:, far].any()
+    assert len({row.tobytes() for row in still}) > 1
+
+
 def test_a_stiff_inclusion_is_strained_less():
     settings = FEW.model_copy(update={"loads": ["force"], "inclusion": [100.0, 100.0]})
     inclusion = ball(0.4, at=(0.3, 0, 0))
