@@ -40,6 +40,7 @@ check: .venv/installed
 	$(BIN)/dine config check config.yaml
 	$(BIN)/dine config check config/evidence.yaml config.yaml config/tiny.yaml
 	$(BIN)/dine config check config.yaml config/full.yaml
+	$(BIN)/dine config check config.yaml config/large.yaml
 	$(BIN)/dine config check config/evidence.yaml config.yaml config/unseen.yaml
 	$(BIN)/snakemake all -n --quiet
 
