@@ -1,5 +1,9 @@
 """A prior of one organ: learned from its deformations, kept in a file, and registered with."""
 
+import re
+import shlex
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
@@ -296,6 +300,26 @@ def test_from_meshes_to_a_moved_tumour(tmp_path):
         assert "leave out --backbone" in str(done.exception)
     done = run("register-many", tmp_path, "-o", tmp_path / "many", "--prior", file)
     assert isinstance(done.exception, ConfigError)
+
+
+def test_the_commands_of_the_page(tmp_path, monkeypatch):
+    """As they stand there, but for fewer and coarser fields."""
+    page = Path(__file__).parents[2] / "docs" / "guide" / "organ.md"
+    block = re.search(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)[1]
+    less = {
+        "simulate": ["--fields", "6", "--settings", '{"edge": 0.3}'],
+        "learn": ["--settings", SETTINGS.model_dump_json()],
+    }
+    monkeypatch.chdir(tmp_path)
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.05)
+    write_surface(Path("tumour.ply"), Surface(np.asarray(ball.vertices), np.asarray(ball.faces)))
+    commands = [shlex.split(line, comments=True)[1:] for line in block.splitlines()]
+    assert [words[0] for words in commands] == ["scans", "simulate", "learn", "register"]
+    for words in commands:
+        done = run(*words, *less.get(words[0], []))
+        assert done.exit_code == 0, done.exception
+    assert "bound_90" in read_surface("moved.tumour.ply").data
+    assert Path("moved.html").exists()
 
 
 def test_a_folder_of_other_meshes_is_refused(tmp_path):
