@@ -30,7 +30,7 @@ _LOWERED = 0.5
 _SMALL = 0.01
 # 5 % of the diameter, at which the evaluation calls a point lost.
 _INCONSISTENT = 0.1
-# Of the surface, and of the radius: on every second of 23 objects (benchmarks/surfaces.py).
+# Of the surface, and of the radius: on the strongest deformations of benchmarks/surfaces.py.
 _UNMET = 0.15
 _UNSURE = 0.06
 
