@@ -18,6 +18,7 @@ LONG = (
 )
 
 
+@pytest.hookimpl(tryfirst=True)  # xdist reads the marks in its own
 def pytest_collection_modifyitems(items):
     """``pytest -n 2 --dist loadgroup``: a file, or what it marks as a group, stays together."""
     if "PYTEST_XDIST_WORKER" not in os.environ:

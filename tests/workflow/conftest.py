@@ -21,9 +21,9 @@ def undisturbed(tmp_path_factory) -> Undisturbed:
     for name in ("run", "traces"):
         (root / name).mkdir()
     place = Workplace(root / "run", HERE / "smallest.yaml")
-    place.trace = root / "traces"
+    place.warm, place.trace = True, root / "traces"
     place.run("all", cores=2)
-    place.trace = None
+    place.warm, place.trace = False, None
     finished = place.copy(root / "finished")
     place.empty()
     return Undisturbed(place, finished, root / "traces")

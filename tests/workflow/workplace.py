@@ -62,8 +62,9 @@ class Workplace:
     def __init__(self, folder: Path, *configs: Path, package: Path = ROOT):
         self.folder = folder
         self.package = package
-        self.trace: Path | None = None
         self.warm = False
+        self.trace: Path | None = None
+        """Where warm jobs note what they have run."""
         self.configs = [Path(path.name) for path in configs]
         for name in ("Snakefile", "config.yaml"):
             shutil.copy(ROOT / name, folder)
@@ -101,12 +102,11 @@ class Workplace:
     def environment(self) -> dict[str, str]:
         path = [str(self.package), str(self.folder / "code")]
         extra = {}
-        if self.trace:
-            path.insert(0, str(HERE / "trace"))
-            extra["DINE_TRACE"] = str(self.trace)
-        elif self.warm:
+        if self.warm:
             path.append(str(WARM))
             extra["DINE_WARM"] = warm()["DINE_WARM"]
+            if self.trace:
+                extra["DINE_TRACE"] = str(self.trace)
         return os.environ | extra | {"PYTHONPATH": os.pathsep.join(path)}
 
     def call(self, *command: str) -> subprocess.CompletedProcess:
@@ -141,7 +141,10 @@ class Workplace:
         locks = self.folder / ".snakemake" / "locks"
         if not locks.is_dir() or not any(locks.iterdir()):
             return False
+        # Nobody kills this.
+        cold, self.warm = not self.warm, True
         self.run("--unlock")
+        self.warm = not cold
         return True
 
     def jobs(self) -> list[Job]:

@@ -3,12 +3,14 @@
 Imports take most of the time of the many small jobs in the tests of the workflow. Python runs this
 file by itself where its folder is in PYTHONPATH, and where DINE_WARM names the socket of a server,
 the process hands over all that makes it one of its own, passes on signals, and ends as the fork
-does. As a script, this is the server. Never used where processes are killed or traced.
+does. As a script, this is the server. Never used where processes are killed.
 """
 
 import atexit
+import contextlib
 import gc
 import importlib
+import importlib.machinery
 import io
 import json
 import os
@@ -34,6 +36,7 @@ LIBRARIES = (
     "yte",
     "zuko",
 )
+TRACED = Path(__file__).parents[1] / "traced.py"
 PASSED_ON = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SNAKEMAKE = ["-m", "snakemake"]
 
@@ -120,15 +123,15 @@ def become(started):
     importlib.invalidate_caches()
     try:
         if arguments[:2] == SNAKEMAKE:
-            # Plans are made with the `dine` of the path, which may be another one.
-            for name in [name for name in sys.modules if name.partition(".")[0] == "dine"]:
-                del sys.modules[name]
+            forget_another_package()
             sys.path.insert(0, started["folder"])
             sys.argv = arguments[1:]
             runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
         else:
             sys.path.insert(0, os.path.dirname(arguments[0]))
             sys.argv = arguments
+            if "DINE_TRACE" in os.environ:
+                runpy.run_path(str(TRACED))
             runpy.run_path(arguments[0], run_name="__main__")
     except SystemExit as error:
         if error.code is not None and not isinstance(error.code, int):
@@ -141,6 +144,15 @@ def become(started):
     return 0
 
 
+def forget_another_package():
+    """Plans are made with the `dine` of the path, which may be another one than the server's."""
+    found = importlib.machinery.PathFinder.find_spec("dine", sys.path)
+    if found is None or os.path.samefile(found.origin, sys.modules["dine"].__file__):
+        return
+    for name in [name for name in sys.modules if name.partition(".")[0] == "dine"]:
+        del sys.modules[name]
+
+
 def leave(code):
     """What Python does in the end, but for freeing all that was imported, which takes a second."""
     threading._shutdown()
@@ -150,8 +162,24 @@ def leave(code):
     end(code)
 
 
+def read_code():
+    """Digests of all commands, and of what they may be given, are kept in this process."""
+    from dine.classical.methods import CLASSICAL
+    from dine.cli import cli
+    from dine.models.backbones import BACKBONES
+    from dine.priors import PRIORS
+    from dine.provenance import code_digest
+    from dine.training.data_terms import DATA_TERMS
+
+    for command in cli.commands:
+        with contextlib.suppress(KeyError):  # a group of commands
+            code_digest(command)
+    for registry in (BACKBONES, CLASSICAL, DATA_TERMS, PRIORS):
+        code_digest("stage2", *registry.names())
+
+
 def warm():
-    """Import what jobs and Snakemake do, and start no thread."""
+    """Import what jobs and Snakemake do, and read the code that both follow; start no thread."""
     import numba
 
     import dine
@@ -161,6 +189,7 @@ def warm():
         if not name.endswith("__main__"):
             importlib.import_module(name)
     numba.njit(lambda: None)()  # the rest of its modules
+    read_code()
     gc.freeze()  # memory that nothing writes to is shared
 
 

@@ -1,4 +1,4 @@
-"""Notes which files of `dine` a command has run functions of; Python imports this by itself."""
+"""Notes which files of `dine` a command has run functions of; warm starts begin with it."""
 
 import atexit
 import json
@@ -22,7 +22,6 @@ def write():
         json.dump({"arguments": sys.argv, "ran": sorted(ran)}, stream)
 
 
-if os.environ.get("DINE_TRACE") and sys.orig_argv[1:] and sys.orig_argv[1].endswith("/dine"):
-    atexit.register(write)
-    threading.settrace(note)
-    sys.settrace(note)
+atexit.register(write)
+threading.settrace(note)
+sys.settrace(note)
