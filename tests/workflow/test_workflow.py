@@ -28,8 +28,7 @@ from dine.results import table_names
 
 ROOT = Path(__file__).parents[2]
 TINY = "config/tiny.yaml"
-SMALLER = "smaller.yaml"
-FINISHED = ("--configfile", TINY, SMALLER)
+FINISHED = ("--configfile", TINY)
 # A space and more than ASCII, since people have such folders.
 RESULTS = "results/tiny rün – 1"
 
@@ -62,8 +61,6 @@ def copy_workflow(folder):
 def finished(tmp_path_factory):
     """A run of ``all`` with each kind of job, and all priors; DefTransNet on one dataset only."""
     folder = copy_workflow(tmp_path_factory.mktemp("workflow run"))
-    smaller = {"backbones": {"deftransnet": {"datasets": ["synbench"]}}}
-    (folder / SMALLER).write_text(yaml.safe_dump(smaller))
     snakemake(folder, "all", *FINISHED)
     return folder
 
@@ -85,8 +82,7 @@ def changed(folder, changes):
     """Arguments for a run of everything with some settings changed."""
     path = folder / "changes.yaml"
     path.write_text(yaml.safe_dump(changes))
-    smaller = [SMALLER] if (folder / SMALLER).exists() else []
-    return ("all", "--configfile", TINY, *smaller, path)
+    return ("all", "--configfile", TINY, path)
 
 
 def test_everything_is_there(finished):
@@ -94,7 +90,7 @@ def test_everything_is_there(finished):
     tables = {path.stem for path in (results / "tables").glob("*.csv")}
     assert {"table1", "table2", "table3", "gains_synbench", "correspondence_synbench"} <= tables
     # What is written is what is expected: the rule's own outputs, and nothing beside.
-    configs = [finished / name for name in ("config.yaml", TINY, SMALLER)]
+    configs = [finished / name for name in ("config.yaml", TINY)]
     assert tables == set(table_names(config.load(*configs)))
     assert "deformation_synbench_unseen" in tables
     for table in tables:
@@ -227,10 +223,10 @@ def test_one_ablation_uses_what_is_cached(finished):
 
 def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
     jobs = planned(copy_workflow(tmp_path), "prior_flow", "--configfile", TINY)
-    # Four Stage-2 runs on DefTransNet; of Robust-DefReg only what the search of λ needs.
-    assert jobs["stage1"] == 3
-    assert (jobs["stage2_control"], jobs["stage2_prior"]) == (2, 2)
-    assert jobs["fit_prior"] == 5
+    # Two Stage-2 runs on DefTransNet; of Robust-DefReg only what the search of λ needs.
+    assert jobs["stage1"] == 2
+    assert (jobs["stage2_control"], jobs["stage2_prior"]) == (1, 1)
+    assert jobs["fit_prior"] == 4
     assert "figures" not in jobs
     assert "html" not in jobs
 
@@ -238,15 +234,15 @@ def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
 def test_the_evidence_is_planned_from_its_config(tmp_path):
     folder = copy_workflow(tmp_path)
     jobs = planned(folder, "evidence", "--configfile", TINY)
-    # Two seeds of two backbones on two datasets; one group of methods without a backbone for each.
-    assert jobs["stage1"] == jobs["stage2_control"] == 8
-    assert jobs["evidence_evaluate"] == 10
+    # Two seeds of three networks; a group of methods without a backbone for each dataset.
+    assert jobs["stage1"] == jobs["stage2_control"] == 6
+    assert jobs["evidence_evaluate"] == 8
     assert jobs["evidence_classical"] == 4
     assert jobs["search_lambda"] == 1
     changes = folder / "changes.yaml"
     changes.write_text("evidence: {seeds: [0], methods: {cpd: null, map: null}}")
     fewer = planned(folder, "evidence", "--configfile", TINY, changes)
-    assert fewer["stage1"] == 4
+    assert fewer["stage1"] == 3
     assert fewer["evidence_classical"] == 2
     assert fewer["evidence_refine"] < jobs["evidence_refine"]
 
