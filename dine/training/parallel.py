@@ -31,6 +31,8 @@ from dine.errors import ConfigError, DineError
 from dine.models.devices import leased
 from dine.models.state import Interrupted, StopRequest
 
+START = "spawn"
+"""How processes are started: CUDA does not survive a fork of a process that has used it."""
 GRACE_SECONDS = 5.0
 """How long the others may take to notice that one process has died, before they are ended."""
 
@@ -188,7 +190,7 @@ def run_together(count: int, device: torch.device, work: Callable[[Team], Any]) 
 def _start(devices: list[torch.device], nodes: Nodes, work: Callable[[Team], Any]) -> None:
     """Start this node's processes and stay until they have ended."""
     count = len(devices)
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context(START)
     stop = context.RawValue("b", 0)
     reader, writer = context.Pipe(duplex=False)
     part = _Part(
@@ -205,7 +207,7 @@ def _start(devices: list[torch.device], nodes: Nodes, work: Callable[[Team], Any
     listener = threading.Thread(target=_listen, args=(reader, errors))
     with StopRequest() as request:
         with _signals_held_back():
-            team = start_processes(_take_part, (part,), count, join=False, start_method="spawn")
+            team = start_processes(_take_part, (part,), count, join=False, start_method=START)
         writer.close()
         listener.start()
         try:

@@ -1,6 +1,7 @@
 """Several processes train as one does, and stop together."""
 
 import contextlib
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -20,6 +21,17 @@ from dine.training.objective import Objective
 pytestmark = pytest.mark.numerical
 ROUNDING = 1e-5
 """Of what was learned: float32 gradients agree to some 1e-7, and Adam's steps are their ratios."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forks():
+    """Processes start as forks of one that has imported all that they need, which takes most of the
+    time else. Those of a command, in test_stages.py, start as they do for users."""
+    preloaded = ("dine.training.stages", "lightning_fabric", "pytest", "torch._dynamo", "zuko")
+    multiprocessing.get_context("forkserver").set_forkserver_preload(list(preloaded))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(parallel, "START", "forkserver")
+        yield
 
 
 class Mover(Backbone):
