@@ -53,9 +53,10 @@ format: .venv/installed
 docs: .venv/installed
 	$(BIN)/properdocs build --quiet --strict --config-file mkdocs.yml
 
-# The package as a user installs it, in an environment of its own outside the checkout.
-wheel-check:
-	PYTHON=$(PYTHON) .ci/wheel
+# The package as a user installs it, in an environment of its own outside the checkout. WHOLE=1: all
+# that it needs from the index, too, which takes minutes.
+wheel-check: .venv/installed
+	PYTHON=$(PYTHON) WHOLE=$(WHOLE) .ci/wheel
 
 # The workflow through Slurm, which is installed and started for it: Debian or Ubuntu, and root.
 slurm-test: .venv/installed
