@@ -13,8 +13,9 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 # Longest first, so that no worker is left alone with one of them in the end.
 LONG = (
-    *("workflow/test_workflow.py", "workflow/", "integration/test_stages.py"),
-    *("hostile/test_fuzz.py", "integration/test_parallel.py"),
+    *("workflow/test_kills.py", "workflow/test_reruns.py", "workflow/test_workflow.py"),
+    *("integration/test_stages.py", "integration/test_register.py", "integration/test_parallel.py"),
+    *("unit/test_evidence.py", "hostile/test_fuzz.py", "project/", "workflow/"),
 )
 
 

@@ -134,13 +134,17 @@ def test_the_digest_follows_the_code_of_the_package(tmp_path, monkeypatch, fresh
     )
     monkeypatch.setattr(provenance, "PACKAGE", package)
 
-    def changed_by(name, text):
+    def digests():
         fresh()
-        before = [code_digest(*step) for step in steps]
+        return [code_digest(*step) for step in steps]
+
+    known = [digests()]
+
+    def changed_by(name, text):
         path = package / name
         path.write_text(text(path.read_text()))
-        fresh()
-        return [step for step in steps if code_digest(*step) != before.pop(0)]
+        known.append(digests())
+        return [step for step, old, new in zip(steps, *known[-2:], strict=True) if old != new]
 
     def longer(text):
         return text + "\nADDED = 1\n"
