@@ -17,8 +17,8 @@ run: .venv/installed
 tiny: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all evidence --configfile config/tiny.yaml
 
-# Two workers, on a core each.
-PYTEST := $(BIN)/pytest -n 2 --dist loadgroup --no-loadscope-reorder
+# Two workers, on a core each, and whole files for each: what the tests of one share is made once.
+PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: .venv/installed
 	OMP_NUM_THREADS=1 $(PYTEST)

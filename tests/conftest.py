@@ -13,15 +13,14 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 # Longest first, so that no worker is left alone with one of them in the end.
 LONG = (
-    *("workflow/test_kills.py", "workflow/test_reruns.py", "workflow/test_workflow.py"),
-    *("integration/test_stages.py", "integration/test_register.py", "integration/test_parallel.py"),
-    *("unit/test_evidence.py", "hostile/test_fuzz.py", "project/", "workflow/"),
+    *("workflow/test_reruns.py", "workflow/test_workflow.py", "integration/test_stages.py"),
+    *("integration/test_register.py", "integration/test_parallel.py", "unit/test_evidence.py"),
+    *("hostile/test_fuzz.py", "project/", "workflow/"),
 )
 
 
-@pytest.hookimpl(tryfirst=True)  # xdist reads the marks in its own
 def pytest_collection_modifyitems(items):
-    """``pytest -n 2 --dist loadgroup``: a file, or what it marks as a group, stays together."""
+    """The order for ``make test``, where each of two workers gets whole files."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     here = Path(__file__).parent
@@ -31,9 +30,6 @@ def pytest_collection_modifyitems(items):
         return next((i for i, start in enumerate(LONG) if name.startswith(start)), len(LONG))
 
     items.sort(key=place)
-    for item in items:
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.path.relative_to(here).as_posix()))
 
 
 @pytest.fixture
