@@ -58,7 +58,9 @@ def most_pairs_per_level(percents: Collection[float], widths: Collection[float])
 class Section(BaseModel):
     """Base of all sections: unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, use_attribute_docstrings=True, defer_build=True
+    )
 
 
 class Source(Section):

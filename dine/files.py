@@ -37,6 +37,7 @@ _STORAGE_ERRNOS = {
 # In the name of a temporary file, after the number of the process that writes it.
 _HERE = f"@{platform.node()[:32]}."
 _TEMPORARY = re.compile(rf"\..*\.(\d+){re.escape(_HERE)}[^.]*\.part(?:\..*)?")
+_WINDOWS = os.name == "nt"
 
 
 @contextlib.contextmanager
@@ -110,6 +111,8 @@ def _tidy(folder: Path, process: int) -> None:
 
 
 def _lives(process: int) -> bool:
+    if _WINDOWS:  # where this signal is no question: it interrupts the process
+        return True
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -8,6 +8,7 @@ classes that the configuration names, a user's own among them.
 from __future__ import annotations
 
 import ast
+import contextlib
 import csv
 import functools
 import hashlib
@@ -279,8 +280,11 @@ def _source(module: str) -> Path | None:
 def versions() -> dict[str, str]:
     """Versions of this package, Python and the libraries that results depend on."""
     names = ("numpy", "scipy", "torch", "scikit-learn", "h5py", "trimesh", "pandas", "zuko")
-    found = {name: metadata.version(name) for name in (*names, "numba")}
-    return {"dine": __version__, "python": platform.python_version(), **found}
+    found = {"dine": __version__, "python": platform.python_version()}
+    for name in (*names, "numba"):
+        with contextlib.suppress(metadata.PackageNotFoundError):  # only an extra brings it
+            found[name] = metadata.version(name)
+    return found
 
 
 def folder_signature(folder: str | os.PathLike) -> str:

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from dine.classical import bcpd
 from dine.errors import ConfigError, DataError
+from dine.extras import extras_needed
 from dine.geometry.rigid import transformed
 from dine.refinement.refine import ROUNDS, Options, refine
 from dine.registry import Registry
@@ -132,13 +133,8 @@ class CPD(Classical):
     tolerance: float = 1e-7
 
     def moved(self, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-        try:
+        with extras_needed():
             import rustcpd
-        except ImportError as error:
-            raise ConfigError(
-                "The classical method 'cpd' needs rustcpd: pip install "
-                "dine-registration[classical]."
-            ) from error
         return rustcpd.register_deformable(
             target,
             source,

@@ -16,6 +16,7 @@ from dine import __version__
 from dine.cli import configuration, data, evaluation, organ, registration, reporting, training
 from dine.cli.options import OUT
 from dine.errors import DineError
+from dine.extras import extras_needed
 from dine.files import storage_errors
 
 log = logging.getLogger("dine")
@@ -57,7 +58,8 @@ def main() -> None:
     """Entry point: user errors become one line on standard error."""
     sys.stdout.reconfigure(errors="backslashreplace")  # file names may be no text
     try:
-        cli(standalone_mode=False)
+        with extras_needed():
+            cli(standalone_mode=False)
     except click.exceptions.Abort:
         sys.exit(130)
     except click.ClickException as error:

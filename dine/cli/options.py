@@ -72,6 +72,11 @@ def settings_option(model: type[config.Section]):
     )
 
 
+def default_of(section: type[config.Section], key: str) -> Any:
+    """The default of a setting, without building what checks its whole section."""
+    return section.model_fields[key].default
+
+
 def out_option(help: str, type: click.ParamType = OUT):
     return click.option("--out", type=type, required=True, help=help)
 
@@ -81,7 +86,7 @@ name_option = click.option("--name", default="", help="Shown with the progress."
 batch_option = click.option(
     "--batch-size",
     type=click.IntRange(1),
-    default=config.Evaluation().batch_size,
+    default=default_of(config.Evaluation, "batch_size"),
     show_default=True,
     help="Pairs at a time.",
 )
@@ -129,7 +134,7 @@ def compute_flags(*names: str) -> list[Callable]:
         click.option(
             f"--{name}",
             type=kinds[name],
-            default=fields[name].default,
+            default=default_of(config.Compute, name),
             show_default=True,
             help=fields[name].description,
         )

@@ -9,6 +9,7 @@ from dine.cli.options import (
     FOLDER,
     IN,
     OUT_FOLDER,
+    default_of,
     gathered,
     json_or_file,
     name_option,
@@ -51,7 +52,7 @@ def diagnose(prior, fields, pairs, facts, seed, out):
 @click.option(
     "--spread",
     type=click.FloatRange(0),
-    default=config.Evaluation().training_spread,
+    default=default_of(config.Evaluation, "training_spread"),
     help="How much differences vary with the training (`evaluation.training_spread`).",
 )
 @out_option("Folder for CSV, Markdown and LaTeX.", OUT_FOLDER)

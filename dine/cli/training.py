@@ -15,6 +15,7 @@ from dine.cli.options import (
     batch_option,
     compute_flags,
     compute_options,
+    default_of,
     gathered,
     model_option,
     name_option,
@@ -32,7 +33,8 @@ backbone_option = click.option(
     "--backbone",
     type=SectionType(config.BackboneConfig),
     default="{}",
-    help=f"Kind and arguments of the backbone; by default {config.BackboneConfig().kind}.",
+    help="Kind and arguments of the backbone; by default "
+    f"{default_of(config.BackboneConfig, 'kind')}.",
 )
 
 

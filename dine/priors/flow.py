@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dine.config import FlowArguments
+from dine.extras import extras_needed
 from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, Sample, check_sizes
 from dine.priors.likelihood import Ascent, Unfinished, maximise_likelihood
 
@@ -24,7 +25,8 @@ class FlowPrior(Prior):
     resumable = True
 
     def __init__(self, points: int, transforms: int, hidden: int):
-        import zuko  # slow to import, and other priors do not need it
+        with extras_needed():
+            import zuko  # slow to import, and other priors do not need it
 
         check_sizes("flow", points=points, hidden=hidden)
         check_sizes("flow", LARGEST_DEPTH, transforms=transforms)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from dine.config import LatentFlowArguments
 from dine.errors import DataError
+from dine.extras import extras_needed
 from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian
 from dine.priors.likelihood import Ascent, Best, Unfinished, maximise_likelihood
@@ -35,7 +36,8 @@ class LatentFlowPrior(PCAResidualPrior):
     resumable = True
 
     def __init__(self, points: int, components: int, transforms: int, hidden: int):
-        import zuko  # slow to import, and other priors do not need it
+        with extras_needed():
+            import zuko  # slow to import, and other priors do not need it
 
         check_sizes("latent_flow", hidden=hidden)
         check_sizes("latent_flow", LARGEST_DEPTH, transforms=transforms)

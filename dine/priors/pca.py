@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dine.config import PCAArguments
 from dine.errors import DataError
+from dine.extras import extras_needed
 from dine.priors.base import PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian
 
@@ -51,8 +52,9 @@ class PCAPrior(Prior):
     def _of_span(cls, fields: np.ndarray, given: PCAArguments, **shape: Any) -> Self:
         """The prior with span and latent covariance of the fields; ``shape`` goes to the class."""
         # Only fitting needs scikit-learn, which takes a while to import.
-        from sklearn.covariance import empirical_covariance, shrunk_covariance
-        from sklearn.decomposition import PCA
+        with extras_needed():
+            from sklearn.covariance import empirical_covariance, shrunk_covariance
+            from sklearn.decomposition import PCA
 
         flat = fields.reshape(len(fields), -1)
         kept = min(given.components, len(flat) - 1, flat.shape[1])

@@ -28,6 +28,7 @@ from torch.multiprocessing import (
 )
 
 from dine.errors import ConfigError, DineError
+from dine.extras import missing
 from dine.models.devices import leased
 from dine.models.state import Interrupted, StopRequest
 
@@ -173,10 +174,7 @@ def run_together(count: int, device: torch.device, work: Callable[[Team], Any]) 
             Lightning Fabric is not installed.
     """
     if importlib.util.find_spec("lightning_fabric") is None:
-        raise ConfigError(
-            "More than one process needs Lightning Fabric: pip install lightning-fabric, or set "
-            "`processes` to 1."
-        )
+        raise missing("lightning_fabric", "More than one process")
     nodes = nodes_here()
     if count % nodes.count:
         raise ConfigError(

@@ -15,7 +15,6 @@ from importlib import resources
 from typing import Any
 
 import jinja2
-import matplotlib
 import numpy as np
 from markupsafe import Markup
 from scipy.spatial import cKDTree
@@ -28,7 +27,15 @@ from dine.io.writers import check_output
 #: Suffixes that ``write_view`` writes.
 VIEW_SUFFIXES: tuple[str, ...] = (".html", ".htm")
 
-_COLORMAP = "viridis"
+# matplotlib's viridis in 64 steps, for which nobody has to install it.
+_COLORS = """
+    440154 46075a 470d60 471365 48186a 481d6f 482374 482878 472d7b 46327e 453781 443b84
+    424086 404588 3e4989 3d4e8a 3a538b 38588c 365c8d 34608d 32648e 31688e 2f6c8e 2d708e
+    2c738e 2a778e 297b8e 277f8e 26828e 24868e 238a8d 218e8d 20928c 1f968b 1f9a8a 1f9e89
+    1fa187 21a585 23a983 26ad81 2ab07f 2fb47c 35b779 3bbb75 42be71 4ac16d 52c569 5ac864
+    65cb5e 6ece58 77d153 81d34d 8bd646 95d840 a0da39 aadc32 b5de2b c0df25 cae11f d5e21a
+    dfe318 eae51a f4e61e fde725
+"""
 # Values above this share of all are drawn in the last colour if they would stretch the scale.
 _SHOWN = 0.99
 _STRETCH = 1.5
@@ -246,8 +253,7 @@ def _array(array: np.ndarray, kind: str) -> dict[str, str]:
 
 
 def _colors() -> list[str]:
-    colors = matplotlib.colormaps[_COLORMAP](np.linspace(0, 1, 64))
-    return [matplotlib.colors.to_hex(color) for color in colors]
+    return [f"#{color}" for color in _COLORS.split()]
 
 
 def _viewpoint(vertices: np.ndarray) -> dict[str, list[float]]:

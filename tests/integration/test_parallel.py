@@ -220,7 +220,7 @@ def test_more_processes_than_devices(monkeypatch):
 
 def test_fabric_is_asked_for_by_name(monkeypatch):
     monkeypatch.setattr(parallel.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match="pip install lightning-fabric"):
+    with pytest.raises(ConfigError, match=r'pip install "dine-registration\[parallel\]"'):
         parallel.run_together(2, torch.device("cpu"), print)
 
 

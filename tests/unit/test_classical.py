@@ -110,7 +110,7 @@ class TestDeformable:
 
 def test_missing_library(pair, monkeypatch):
     monkeypatch.setitem(sys.modules, "rustcpd", None)
-    with pytest.raises(ConfigError, match=r"pip install dine-registration\[classical\]"):
+    with pytest.raises(ConfigError, match=r'pip install "dine-registration\[classical\]"'):
         CLASSICAL.get("cpd")()(*pair)
 
 

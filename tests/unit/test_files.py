@@ -2,6 +2,7 @@
 
 import errno
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -61,6 +62,15 @@ def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path):
         (tmp_path / name).touch()
     write_text(path, "whole")
     assert set(os.listdir(tmp_path)) == {"result.ply", *others}
+
+
+def test_no_process_is_asked_where_that_would_interrupt_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("dine.files._WINDOWS", True)
+    monkeypatch.setattr(os, "kill", lambda *_: pytest.fail("a process was sent a signal"))
+    left = f".result.1@{platform.node()[:32]}.abc.part.ply"
+    (tmp_path / left).touch()
+    write_text(tmp_path / "result.ply", "whole")
+    assert set(os.listdir(tmp_path)) == {"result.ply", left}
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EDQUOT])

@@ -4,13 +4,14 @@ import re
 from html.parser import HTMLParser
 from importlib import resources
 
+import matplotlib
 import numpy as np
 import pytest
 
 from dine.data.synthetic import primitive
 from dine.errors import DataError, StorageError
 from dine.geometry.surface import Surface
-from dine.viewer.view import View, write_view
+from dine.viewer.view import View, _colors, write_view
 
 SOURCE = primitive(0, 0)
 COUNT = len(SOURCE.vertices)
@@ -84,6 +85,11 @@ def test_arrays_come_back(tmp_path):
         assert entry["name"] == name
         np.testing.assert_allclose(decode(entry["values"]), values, rtol=1e-6)
     assert [entry["unit"] for entry in data["scalars"]] == ["mm", ""]
+
+
+def test_colours_are_viridis():
+    steps = matplotlib.colormaps["viridis"](np.linspace(0, 1, 64))
+    assert _colors() == [matplotlib.colors.to_hex(color) for color in steps]
 
 
 def test_nothing_is_loaded_from_anywhere(tmp_path):
