@@ -85,18 +85,23 @@ def view_of(result: RegistrationResult, source: Surface, scalars: Mapping[str, n
     )
 
 
+def _number(value: float) -> str:
+    """Three digits, as many as lengths deserve."""
+    return f"{value:,.0f}" if 1000 <= abs(value) < 1e9 else f"{value:#.3g}".rstrip(".")
+
+
 def _facts(result: RegistrationResult) -> dict[str, str]:
     report = result.report
     facts = {
-        "HD95": f"{report['before']['hd95']:.3g} → {report['after']['hd95']:.3g}",
-        "Largest displacement": f"{report['displacement']['max']:.3g}",
+        "HD95": " → ".join(_number(report[when]["hd95"]) for when in ("before", "after")),
+        "Largest displacement": _number(report["displacement"]["max"]),
         "Folded": f"{100 * report['folding']:.1f} %",
     }
     if result.bound is not None and result.uncertainty is not None:
-        facts["Posterior deviation"] = f"{result.uncertainty.mean():.3g}"
-        facts["90 % bound"] = f"{result.bound.mean():.3g}"
+        facts["Posterior deviation"] = _number(result.uncertainty.mean())
+        facts["90 % bound"] = _number(result.bound.mean())
     elif result.trust.expected_error is not None:
-        facts["Expected error"] = f"{result.trust.expected_error:.3g}"
+        facts["Expected error"] = _number(result.trust.expected_error)
     facts["Network"] = str(report["backbone"] or "none, the prior of an organ")
     facts["Time"] = f"{report['seconds']:.1f} s"
     return facts

@@ -100,7 +100,7 @@
   /** A surface where there are faces, a cloud of round points where there are none. */
   function shapeOf(geometry, color) {
     if (!geometry.index) {
-      const material = new THREE.PointsMaterial({ color, map: ball, alphaToCoverage: true });
+      const material = new THREE.PointsMaterial({ color, map: ball });
       return new THREE.Points(geometry, material);
     }
     const material = new THREE.MeshPhongMaterial({
@@ -129,6 +129,7 @@
     material.opacity = opacity;
     material.wireframe = lines;
     material.transparent = seeThrough;
+    material.alphaToCoverage = Boolean(material.map) && !seeThrough; // it would make points opaque
     material.depthWrite = !seeThrough;
     // Where shapes coincide, lines are in front of opaque surfaces, these of see-through ones.
     material.polygonOffset = !lines;
@@ -191,7 +192,7 @@
   // --- colours ------------------------------------------------------------------------------
 
   const minus = (text) => text.replaceAll("-", "−");
-  const digits = (value) => minus(String(Number(value.toPrecision(4))));
+  const digits = (value) => minus(String(Number(value.toPrecision(3))));
   const withUnit = (value, unit) => (unit ? `${digits(value)} ${unit}` : digits(value));
 
   const RAMP = `linear-gradient(to right, ${data.colormap.join(",")})`;
@@ -405,8 +406,12 @@
   });
 
   function describe(vertex) {
-    const end = data.centre.map((middle, axis) => middle + data.radius * result[3 * vertex + axis]);
-    const lines = [`point ${rows ? rows[vertex] : vertex}`, `moved to ${end.map(digits).join(", ")}`];
+    // To a thousandth of the radius, wherever the object lies.
+    const decimals = Math.min(Math.max(0, 3 - Math.floor(Math.log10(data.radius))), 20);
+    const end = data.centre.map((middle, axis) => {
+      return minus((middle + data.radius * result[3 * vertex + axis]).toFixed(decimals));
+    });
+    const lines = [`point ${rows ? rows[vertex] : vertex}`, `moved to ${end.join(", ")}`];
     for (const { name, unit, values } of scalars) {
       const value = values[vertex];
       lines.push(`${name}: ${Number.isNaN(value) ? "no value" : withUnit(value, unit)}`);
@@ -447,7 +452,7 @@
 
   function drawColours({ name, unit, low, high, over }) {
     const [x, y, wide, thick] = [20, 32, Math.min(220, camera.right), 12];
-    put("text", { x, y: 22 }, unit ? `${name}, ${unit}` : name);
+    put("text", { x, y: 22 }, unit ? `${name} (${unit})` : name);
     data.colormap.forEach((fill, i) => {
       const width = wide / data.colormap.length;
       const rect = { x: x + i * width, y, width: width + 0.5, height: thick, fill };

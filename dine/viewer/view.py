@@ -125,7 +125,7 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
     sparse = small_target.faces is None or len(small_target.faces) <= _SPARSE
     layers = [
         _layer("moved", "Moved source", source, rows, "#3f7fc4", opacity=100, shown=True),
-        _layer("target", "Target", target, target_rows, "#3d4854", opacity=60, shown=sparse),
+        _layer("target", "Target", target, target_rows, "#4a5562", opacity=50, shown=sparse),
         _layer("source", "Source", source, rows, "#d08a3c", opacity=60, shown=False),
     ]
     for layer in layers:
@@ -160,7 +160,7 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         "unit": view.unit,
         "axes": axis_names(target.space),
         "sides": sides(target.space),
-        "view": first_side(source, target.space),
+        "view": first_side(Surface(result, source.faces), target.space),
     }
 
 
