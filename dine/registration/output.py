@@ -22,10 +22,11 @@ from dine.io.writers import (
     write_moved,
     written_suffix,
 )
+from dine.registration.page import view_of
 from dine.registration.saved import ENDING, write_result
 from dine.registration.shapes import check_spaces
 from dine.registration.types import RegistrationResult
-from dine.viewer.view import View, write_view
+from dine.viewer.view import write_view
 
 
 @dataclass(frozen=True)
@@ -120,15 +121,7 @@ def save(
         said += lost(surface)
         said += cannot_hold(path, write_moved(path, surface, overwrite=overwrite))
     if view:
-        shown = View(
-            _aligned_source(result),
-            result.target,
-            result.moved.vertices,
-            f"{Path(result.source.name).name} → {Path(result.target.name).name}",
-            scalars=scalars,
-            units=dict.fromkeys(scalars, "in units of the files"),
-            facts=_facts(result),
-        )
+        shown = view_of(result, _aligned_source(result), scalars)
         write_view(outputs.view, shown, overwrite=overwrite)
     write_result(outputs.result, result)
     write_json(outputs.report, result.report)
@@ -225,20 +218,3 @@ def _scalars(result: RegistrationResult) -> dict[str, np.ndarray]:
 def _words(scalars: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     renamed = {"displacement": "displacement_length"}
     return {renamed.get(k, k.replace(" ", "_")): value for k, value in scalars.items()}
-
-
-def _facts(result: RegistrationResult) -> dict[str, str]:
-    report = result.report
-    facts = {
-        "HD95": f"{report['before']['hd95']:.3g} → {report['after']['hd95']:.3g}",
-        "Largest displacement": f"{report['displacement']['max']:.3g}",
-        "Folded": f"{100 * report['folding']:.1f} %",
-        "Verdict": result.trust.verdict,
-    }
-    if result.trust.expected_error is not None:
-        facts["Expected error"] = f"{result.trust.expected_error:.3g}"
-    if result.trust.reasons:
-        facts["Note"] = " ".join(result.trust.reasons)
-    facts["Backbone"] = str(report["backbone"] or "none, the prior of an organ")
-    facts["Time"] = f"{report['seconds']:.1f} s"
-    return facts

@@ -4,7 +4,7 @@
   const get = (id) => document.getElementById(id);
   const data = JSON.parse(get("data").textContent);
   const canvas = get("stage");
-  const NO_VALUE = [0.72, 0.75, 0.78];
+  const NO_VALUE = [0.36, 0.37, 0.39]; // linear light: darker than the background
 
   function stop(message) {
     get("problem").hidden = false;
@@ -66,10 +66,17 @@
   const rows = data.source.rows && decode(data.source.rows); // where a mesh is shown in part
   const scalars = data.scalars.map((scalar) => ({ ...scalar, values: decode(scalar.values) }));
 
+  let stale = true;
+  function draw() {
+    stale = true;
+  }
+
   // --- scene --------------------------------------------------------------------------------
 
   const scene = new THREE.Scene();
-  const camera = new THREE.PerspectiveCamera(30, 1, 0.01, 100);
+  // Without perspective, so that lengths compare and the scale bar holds at any depth. Its frame is
+  // in pixels: zoom is pixels per radius of all shapes.
+  const camera = new THREE.OrthographicCamera(-1, 1, 1, -1, 0.01, 40);
 
   /** A small ball in light grey, which colours tint: it gives points some depth. */
   function ballTexture() {
@@ -91,11 +98,9 @@
   const ball = ballTexture();
 
   /** A surface where there are faces, a cloud of round points where there are none. */
-  function shapeOf(geometry, color, pointSize) {
+  function shapeOf(geometry, color) {
     if (!geometry.index) {
-      // three.js takes sizes as if the field of view were 90 degrees.
-      const size = pointSize / Math.tan((camera.fov / 2) * (Math.PI / 180));
-      const material = new THREE.PointsMaterial({ color, size, map: ball, alphaToCoverage: true });
+      const material = new THREE.PointsMaterial({ color, map: ball });
       return new THREE.Points(geometry, material);
     }
     const material = new THREE.MeshPhongMaterial({
@@ -107,7 +112,7 @@
       shader.fragmentShader = shader.fragmentShader.replace(
         "#include <opaque_fragment>",
         `#ifdef SEE_THROUGH
-          float facing = abs(dot(normalize(vViewPosition), normal));
+          float facing = abs(normal.z);
           float rim = pow(1.0 - facing, 1.5);
           diffuseColor.a = mix(opacity * opacity, min(1.0, 1.8 * opacity), rim);
         #endif
@@ -117,16 +122,20 @@
     return new THREE.Mesh(geometry, material);
   }
 
-  function setOpacity(shape, opacity) {
+  /** Opacity 0 to 1, and whether a mesh is drawn by its lines. */
+  function setStyle(shape, opacity, lines) {
     const { material } = shape;
     const seeThrough = opacity < 1;
     material.opacity = opacity;
+    material.wireframe = lines;
     material.transparent = seeThrough;
+    material.alphaToCoverage = Boolean(material.map) && !seeThrough; // it would make points opaque
     material.depthWrite = !seeThrough;
-    material.polygonOffset = seeThrough; // where surfaces coincide, the opaque one is in front
-    material.polygonOffsetFactor = material.polygonOffsetUnits = 2;
+    // Where shapes coincide, lines are in front of opaque surfaces, these of see-through ones.
+    material.polygonOffset = !lines;
+    material.polygonOffsetFactor = material.polygonOffsetUnits = seeThrough ? 3 : 1;
     material.alphaTest = material.map ? 0.5 * opacity : 0;
-    material.defines = seeThrough ? { SEE_THROUGH: "" } : {};
+    material.defines = seeThrough && !lines ? { SEE_THROUGH: "" } : {};
     material.needsUpdate = true;
     shape.renderOrder = seeThrough ? 1 : 0;
   }
@@ -149,20 +158,31 @@
     source: geometryOf(source, sourceFaces),
   };
   const layers = {};
-  for (const { id, color, opacity, shown } of data.layers) {
-    const size = (id === "target" ? data.target : data.source).pointSize;
-    const shape = shapeOf(geometries[id], color, size);
-    setOpacity(shape, opacity / 100);
+  for (const { id, color, opacity, shown, mesh, lines } of data.layers) {
+    const shape = shapeOf(geometries[id], color);
+    shape.userData.pointSize = (id === "target" ? data.target : data.source).pointSize;
     shape.visible = shown;
     layers[id] = shape;
     scene.add(shape);
+    const style = { opacity: opacity / 100, lines };
+    const restyle = () => {
+      setStyle(shape, style.opacity, style.lines);
+      draw();
+    };
+    setStyle(shape, style.opacity, lines);
     get(`show-${id}`).addEventListener("change", (event) => {
       shape.visible = event.target.checked;
       draw();
     });
     get(`opacity-${id}`).addEventListener("input", (event) => {
-      setOpacity(shape, event.target.value / 100);
-      draw();
+      style.opacity = event.target.value / 100;
+      restyle();
+    });
+    if (!mesh) continue;
+    get(`lines-${id}`).addEventListener("click", (event) => {
+      style.lines = !style.lines;
+      event.target.setAttribute("aria-pressed", style.lines);
+      restyle();
     });
   }
   const moved = layers.moved;
@@ -172,18 +192,14 @@
   // --- colours ------------------------------------------------------------------------------
 
   const minus = (text) => text.replaceAll("-", "−");
-  const digits = (value) => minus(String(Number(value.toPrecision(4))));
-
-  /** Writes numbers of a range with equally many decimals, three digits for its width. */
-  function scaleFormat(range) {
-    const decimals = Math.max(0, 2 - Math.floor(Math.log10(range || 1)));
-    return (value) => minus(decimals > 6 ? value.toExponential(2) : value.toFixed(decimals));
-  }
+  const digits = (value) => minus(String(Number(value.toPrecision(3))));
+  const withUnit = (value, unit) => (unit ? `${digits(value)} ${unit}` : digits(value));
 
   const RAMP = `linear-gradient(to right, ${data.colormap.join(",")})`;
+  let coloured = null; // the scalar that is shown
 
   function colorBy(index) {
-    const chosen = scalars[index] || null;
+    const chosen = (coloured = scalars[index] || null);
     const { material } = moved;
     material.vertexColors = chosen !== null;
     material.color.copy(plain);
@@ -192,31 +208,20 @@
       moving.setAttribute("color", new THREE.BufferAttribute(colorsOf(chosen), 3));
     }
     material.needsUpdate = true;
-    get("bar").hidden = !chosen;
     get("swatch-moved").style.background = chosen ? RAMP : data.layers[0].color;
-    if (chosen) labelBar(chosen);
+    get("note").textContent = chosen ? about(chosen) : "";
     draw();
   }
 
-  function labelBar({ low, high, over, missing, unit }) {
-    const format = scaleFormat(high - low);
-    get("ticks").replaceChildren(
-      ...[0, 0.25, 0.5, 0.75, 1].map((share) => {
-        const tick = document.createElement("span");
-        const sign = share === 1 && over > 0 ? "≥ " : "";
-        tick.textContent = sign + format(low + share * (high - low));
-        tick.style.left = `${100 * share}%`;
-        return tick;
-      })
-    );
-    const notes = [unit ? `in ${unit}` : "without unit"];
-    if (over > 0) notes.push(`${over} points above the scale`);
-    if (missing > 0) notes.push(`grey: ${missing} points without a value`);
-    get("note").textContent = notes.join("; ");
+  function about({ over, missing, mean, largest, unit, explained }) {
+    const notes = [];
+    if (mean !== null) notes.push(`Mean ${digits(mean)}, largest ${withUnit(largest, unit)}.`);
+    if (over > 0) notes.push(`${over} points are above the scale.`);
+    if (missing > 0) notes.push(`Grey: ${missing} points without a value.`);
+    return [explained, ...notes].filter(Boolean).join(" ");
   }
 
   if (scalars.length) {
-    get("ramp").style.background = RAMP;
     get("scalar").addEventListener("change", (event) => colorBy(Number(event.target.value)));
   }
 
@@ -252,37 +257,60 @@
   const controls = new THREE.TrackballControls(camera, canvas);
   controls.rotateSpeed = 3;
   controls.zoomSpeed = 1.2;
-  controls.panSpeed = 0.6;
-  controls.dynamicDampingFactor = 0.18;
+  controls.staticMoving = true;
   controls.keys = [];
-  controls.minDistance = 0.05; // all shapes together have radius 1 and their middle at 0
-  controls.maxDistance = 40;
+  const DISTANCE = 20; // all shapes together have radius 1 and their middle at 0
+  const MARGIN = [24, 76]; // pixels beside the shapes, and above and below them for the scales
+  let untouched = true; // the first view stays fitted when the window changes
+
+  /** Half the extent of all that is drawn, along two unit vectors. */
+  function extent(right, up) {
+    const most = [1e-3, 1e-3];
+    for (const points of [source, result, geometries.target.attributes.position.array]) {
+      for (let i = 0; i < points.length; i += 3) {
+        const [x, y, z] = [points[i], points[i + 1], points[i + 2]];
+        if (x * x + y * y + z * z > 1.001) continue; // no face uses it
+        [right, up].forEach((axis, k) => {
+          most[k] = Math.max(most[k], Math.abs(x * axis.x + y * axis.y + z * axis.z));
+        });
+      }
+    }
+    return most;
+  }
 
   /** Look at the middle from a direction, with everything in the picture. */
-  function lookFrom(direction, up) {
-    const half = (camera.fov / 2) * (Math.PI / 180);
-    const narrow = Math.min(1, camera.aspect);
-    const distance = 1.04 / Math.sin(Math.atan(Math.tan(half) * narrow));
+  function lookFrom({ direction, up }) {
+    const [eye, top] = [new THREE.Vector3(...direction), new THREE.Vector3(...up)];
+    const [wide, high] = extent(new THREE.Vector3().crossVectors(top, eye), top);
     controls.reset();
     controls.target.set(0, 0, 0);
-    camera.position.set(...direction).normalize().multiplyScalar(distance);
-    camera.up.set(...up);
-    camera.near = distance / 500;
-    camera.far = distance * 60;
+    camera.position.copy(eye).multiplyScalar(DISTANCE);
+    camera.up.copy(top);
+    camera.zoom = Math.max(
+      Math.min(camera.right / wide, camera.top / high) / 4, // where margins leave nothing
+      Math.min((camera.right - MARGIN[0]) / wide, (camera.top - MARGIN[1]) / high)
+    );
+    controls.minZoom = camera.zoom / 10;
+    controls.maxZoom = camera.zoom * 200;
     camera.updateProjectionMatrix();
     controls.update();
     draw();
   }
 
-  const SIDES = [
-    [[1, 0, 0], [0, 0, 1]], [[-1, 0, 0], [0, 0, 1]], [[0, 1, 0], [0, 0, 1]],
-    [[0, -1, 0], [0, 0, 1]], [[0, 0, 1], [0, 1, 0]], [[0, 0, -1], [0, 1, 0]],
-  ];
-  const reset = () => lookFrom(data.view.direction, data.view.up);
+  function reset() {
+    lookFrom(data.view);
+    untouched = true;
+  }
   for (const button of document.querySelectorAll("[data-side]")) {
-    button.addEventListener("click", () => lookFrom(...SIDES[button.dataset.side]));
+    button.addEventListener("click", () => {
+      untouched = false;
+      lookFrom(data.sides[button.dataset.side]);
+    });
   }
   get("reset").addEventListener("click", reset);
+  for (const event of ["pointerdown", "wheel"]) {
+    canvas.addEventListener(event, () => (untouched = false));
+  }
 
   function turn(right, up) {
     const eye = camera.position.clone().sub(controls.target);
@@ -296,15 +324,14 @@
     const eye = camera.position.clone().sub(controls.target);
     const side = new THREE.Vector3().crossVectors(camera.up, eye).normalize();
     const step = side.multiplyScalar(right).addScaledVector(camera.up.clone().normalize(), up);
-    step.multiplyScalar(eye.length());
+    step.multiplyScalar((2 * camera.top) / camera.zoom);
     camera.position.add(step);
     controls.target.add(step);
   }
 
   function zoom(factor) {
-    const eye = camera.position.clone().sub(controls.target).multiplyScalar(factor);
-    eye.clampLength(controls.minDistance, controls.maxDistance);
-    camera.position.copy(controls.target).add(eye);
+    camera.zoom = Math.min(Math.max(camera.zoom * factor, controls.minZoom), controls.maxZoom);
+    camera.updateProjectionMatrix();
   }
 
   canvas.addEventListener("keydown", (event) => {
@@ -314,68 +341,187 @@
     ];
     if (arrow && event.shiftKey) shift(-0.03 * arrow[0], -0.03 * arrow[1]);
     else if (arrow) turn(-0.12 * arrow[0], -0.12 * arrow[1]);
-    else if (event.key === "+" || event.key === "=") zoom(0.9);
-    else if (event.key === "-" || event.key === "_") zoom(1 / 0.9);
-    else if (event.key === "0") reset();
-    else return;
+    else if (event.key === "+" || event.key === "=") zoom(1 / 0.9);
+    else if (event.key === "-" || event.key === "_") zoom(0.9);
+    else if (event.key !== "0") return;
     event.preventDefault();
+    untouched = false;
+    if (event.key === "0") reset();
     draw();
   });
 
   // --- values at a click --------------------------------------------------------------------
 
-  /** Index of the frontmost vertex of the moved source within 12 pixels of a place, or -1. */
+  const place = new THREE.Vector3();
+
+  /** Where a vertex of the moved source is on the canvas: x, y in pixels, depth in z. */
+  function onScreen(vertex) {
+    const share = moved.morphTargetInfluences[0];
+    const at = (k) => source[3 * vertex + k] + share * (result[3 * vertex + k] - source[3 * vertex + k]);
+    place.set(at(0), at(1), at(2)).project(camera);
+    place.x = (1 + place.x) * camera.right;
+    place.y = (1 - place.y) * camera.top;
+    return place;
+  }
+
+  /** The vertex of the moved source at a place of the canvas, or -1. */
   function pick(x, y) {
     if (!moved.visible) return -1;
     camera.updateMatrixWorld();
-    const share = moved.morphTargetInfluences[0];
-    const point = new THREE.Vector3();
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const distance = (vertex) => {
+      const at = onScreen(vertex);
+      return Math.hypot(at.x - x, at.y - y);
+    };
+    if (sourceFaces) {
+      const ray = new THREE.Raycaster();
+      ray.setFromCamera(new THREE.Vector2(x / camera.right - 1, 1 - y / camera.top), camera);
+      const hit = ray.intersectObject(moved)[0];
+      if (!hit) return -1;
+      const corners = [hit.face.a, hit.face.b, hit.face.c];
+      return corners.reduce((best, corner) => (distance(corner) < distance(best) ? corner : best));
+    }
     let [best, depth] = [-1, Infinity];
-    for (let i = 0; i < source.length; i += 3) {
-      point.set(
-        source[i] + share * (result[i] - source[i]),
-        source[i + 1] + share * (result[i + 1] - source[i + 1]),
-        source[i + 2] + share * (result[i + 2] - source[i + 2])
-      );
-      point.project(camera);
-      const off = Math.hypot((0.5 + point.x / 2) * width - x, (0.5 - point.y / 2) * height - y);
+    for (let vertex = 0; vertex < source.length / 3; vertex++) {
+      const off = distance(vertex);
       // Behind by a little is better than beside: the nearest pixel counts as depth, too.
-      if (off < 12 && Math.abs(point.z) <= 1 && point.z + 1e-5 * off < depth) {
-        [best, depth] = [i / 3, point.z + 1e-5 * off];
+      if (off < 12 && place.z + 1e-4 * off < depth) {
+        [best, depth] = [vertex, place.z + 1e-4 * off];
       }
     }
     return best;
   }
 
   let pressed = null;
+  let picked = -1;
   canvas.addEventListener("pointerdown", (event) => {
     pressed = [event.clientX, event.clientY];
   });
   canvas.addEventListener("pointerup", (event) => {
-    if (!pressed || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 3) return;
+    const steady = event.pointerType === "mouse" ? 3 : 10; // pixels that a click may waver
+    if (!pressed || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > steady) return;
     const box = canvas.getBoundingClientRect();
-    const vertex = pick(event.clientX - box.left, event.clientY - box.top);
-    get("readout").textContent = vertex < 0 ? "" : describe(vertex);
+    picked = pick(event.clientX - box.left, event.clientY - box.top);
+    get("readout").textContent = picked < 0 ? "" : describe(picked);
+    draw();
   });
 
   function describe(vertex) {
-    const place = data.centre.map((middle, axis) => {
-      return middle + data.radius * result[3 * vertex + axis];
+    // To a thousandth of the radius, wherever the object lies.
+    const decimals = Math.min(Math.max(0, 3 - Math.floor(Math.log10(data.radius))), 20);
+    const end = data.centre.map((middle, axis) => {
+      return minus((middle + data.radius * result[3 * vertex + axis]).toFixed(decimals));
     });
-    const lines = [`point ${rows ? rows[vertex] : vertex}`, `moved to ${place.map(digits).join(", ")}`];
+    const lines = [`point ${rows ? rows[vertex] : vertex}`, `moved to ${end.join(", ")}`];
     for (const { name, unit, values } of scalars) {
       const value = values[vertex];
-      lines.push(`${name}: ${Number.isNaN(value) ? "no value" : `${digits(value)} ${unit}`}`);
+      lines.push(`${name}: ${Number.isNaN(value) ? "no value" : withUnit(value, unit)}`);
     }
     return lines.join("\n");
   }
 
+  // --- scales -------------------------------------------------------------------------------
+
+  const overlay = get("overlay");
+
+  /** Add an element to the drawing over the shapes. */
+  function put(name, attributes, text) {
+    const element = document.createElementNS(overlay.namespaceURI, name);
+    for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
+    if (text !== undefined) element.textContent = text;
+    overlay.append(element);
+    return element;
+  }
+
+  /** The largest of 1, 2, 5 times a power of ten that is at most so long. */
+  function round(most) {
+    const power = 10 ** Math.floor(Math.log10(most));
+    return [5, 2, 1].map((digit) => digit * power).find((length) => length <= most * (1 + 1e-9));
+  }
+
+  /** Round numbers from low to high, some four of them. */
+  function ticks(low, high) {
+    const step = round((high - low) / 2);
+    const first = Math.ceil(low / step - 1e-6);
+    const last = Math.floor(high / step + 1e-6);
+    const decimals = Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+    return Array.from({ length: last - first + 1 }, (_, i) => {
+      const value = (first + i) * step;
+      return [value, minus(decimals > 6 ? value.toExponential(1) : value.toFixed(decimals))];
+    });
+  }
+
+  function drawColours({ name, unit, low, high, over }) {
+    const [x, y, wide, thick] = [20, 32, Math.min(220, camera.right), 12];
+    put("text", { x, y: 22 }, unit ? `${name} (${unit})` : name);
+    data.colormap.forEach((fill, i) => {
+      const width = wide / data.colormap.length;
+      const rect = { x: x + i * width, y, width: width + 0.5, height: thick, fill };
+      put("rect", { ...rect, "shape-rendering": "crispEdges" });
+    });
+    if (over > 0) {
+      const tip = `${x + wide},${y} ${x + wide + 9},${y + thick / 2} ${x + wide},${y + thick}`;
+      put("polygon", { points: tip, fill: data.colormap.at(-1) });
+    }
+    for (const [value, text] of ticks(low, high)) {
+      const at = x + (wide * (value - low)) / (high - low);
+      put("path", { d: `M${at} ${y + thick}v4`, stroke: "#1c2733" });
+      put("text", { x: at, y: y + thick + 16, "text-anchor": "middle" }, text);
+    }
+    return `Colours: ${name} from ${withUnit(low, unit)} to ${withUnit(high, unit)}.`;
+  }
+
+  function drawLength() {
+    const perPixel = data.radius / camera.zoom;
+    const length = round(Math.min(160, 0.6 * camera.right) * perPixel);
+    const [right, y] = [2 * camera.right - 20, 2 * camera.top - 20];
+    const left = right - length / perPixel;
+    put("path", { d: `M${left} ${y - 5}v5H${right}v-5`, fill: "none", stroke: "#1c2733", "stroke-width": 2 });
+    const text = withUnit(length, data.unit);
+    put("text", { x: right, y: y - 10, "text-anchor": "end" }, text);
+    return `Scale bar: ${text}.`;
+  }
+
+  function drawAxes() {
+    const [x, y, long] = [52, 2 * camera.top - 52, 30];
+    const turned = ["#b3261e", "#1b7a35", "#1f57c3"].map((colour, axis) => {
+      const end = new THREE.Vector3().setComponent(axis, 1);
+      return { colour, end: end.transformDirection(camera.matrixWorldInverse), text: data.axes[axis] };
+    });
+    turned.sort((a, b) => a.end.z - b.end.z); // the nearest last
+    for (const { colour, end, text } of turned) {
+      const flat = Math.hypot(end.x, end.y);
+      const tip = [x + long * end.x, y - long * end.y];
+      put("path", { d: `M${x} ${y}L${tip.join(" ")}`, stroke: colour, "stroke-width": 2.5 });
+      if (flat < 0.3) put("circle", { cx: tip[0], cy: tip[1], r: 3.5, fill: end.z > 0 ? colour : "#fff", stroke: colour });
+      // The name of an axis that points at the viewer, or away, stands beside it.
+      const [dx, dy] = flat < 0.3 ? [-0.75, 0.75] : [end.x / flat, -end.y / flat];
+      const away = flat < 0.3 ? 14 : 10;
+      put("text", { x: tip[0] + away * dx, y: tip[1] + away * dy + 4, "text-anchor": "middle", fill: colour, "font-weight": 600 }, text);
+    }
+  }
+
+  function drawScales() {
+    overlay.replaceChildren();
+    const said = [];
+    if (coloured && moved.visible) said.push(drawColours(coloured));
+    drawAxes();
+    said.push(drawLength());
+    if (picked >= 0 && moved.visible) {
+      const { x, y } = onScreen(picked);
+      put("circle", { cx: x, cy: y, r: 7, fill: "none", stroke: "#fff", "stroke-width": 4 });
+      put("circle", { cx: x, cy: y, r: 7, fill: "none", stroke: "#1c2733", "stroke-width": 2 });
+    }
+    overlay.setAttribute("aria-label", said.join(" "));
+  }
+
   // --- drawing ------------------------------------------------------------------------------
 
-  let stale = true;
-  function draw() {
-    stale = true;
+  function render() {
+    for (const shape of Object.values(layers)) {
+      shape.material.size = Math.max(2, shape.userData.pointSize * camera.zoom);
+    }
+    renderer.render(scene, camera);
+    drawScales();
   }
 
   function fit() {
@@ -383,9 +529,13 @@
     if (!width || !height) return;
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     renderer.setSize(width, height, false);
-    camera.aspect = width / height;
+    [camera.left, camera.right] = [-width / 2, width / 2];
+    [camera.bottom, camera.top] = [-height / 2, height / 2];
     camera.updateProjectionMatrix();
     controls.handleResize();
+    controls.panSpeed = width / DISTANCE; // what is under the pointer stays there
+    overlay.setAttribute("viewBox", `0 0 ${width} ${height}`);
+    if (untouched) reset();
     draw();
   }
 
@@ -395,12 +545,47 @@
     controls.update();
     if (!stale) return;
     stale = false;
-    renderer.render(scene, camera);
+    render();
   });
+
+  // --- pictures -----------------------------------------------------------------------------
+
+  /** The shapes on white with all scales, twice as fine as on the screen, as a PNG file. */
+  async function savePicture() {
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const scales = new Image();
+    const drawing = overlay.cloneNode(true);
+    drawing.setAttribute("width", 2 * width);
+    drawing.setAttribute("height", 2 * height);
+    const text = new XMLSerializer().serializeToString(drawing);
+    scales.src = `data:image/svg+xml;charset=utf-8,${encodeURIComponent(text)}`;
+    await scales.decode();
+    const sheet = document.createElement("canvas");
+    [sheet.width, sheet.height] = [2 * width, 2 * height];
+    const context = sheet.getContext("2d");
+    context.fillStyle = "#fff";
+    context.fillRect(0, 0, sheet.width, sheet.height);
+    renderer.setPixelRatio(2);
+    render(); // what was drawn before is gone from memory by now
+    context.drawImage(canvas, 0, 0, sheet.width, sheet.height);
+    context.drawImage(scales, 0, 0, sheet.width, sheet.height);
+    fit();
+    const file = await new Promise((done) => sheet.toBlob(done, "image/png"));
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(file);
+    link.download = `${document.title.replace(/[^\p{L}\p{N}._-]+/gu, "-")}.png`;
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 60000);
+  }
+
+  get("picture").addEventListener("click", () =>
+    savePicture().catch((problem) => {
+      get("readout").textContent = `The picture could not be saved: ${problem.message}`;
+    })
+  );
 
   fit();
   new ResizeObserver(fit).observe(canvas);
-  reset();
   if (scalars.length) colorBy(0);
   moveTo(1);
 })();

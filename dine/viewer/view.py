@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
@@ -23,6 +23,7 @@ from dine.errors import DataError
 from dine.files import write_text
 from dine.geometry.surface import Surface
 from dine.io.writers import check_output
+from dine.viewer.sides import axis_names, first_side, sides
 
 #: Suffixes that ``write_view`` writes.
 VIEW_SUFFIXES: tuple[str, ...] = (".html", ".htm")
@@ -41,6 +42,8 @@ _SHOWN = 0.99
 _STRETCH = 1.5
 # Of each shape: more make files that browsers open slowly, and nothing that a screen shows.
 _MOST = 100_000
+# Faces of a target whose mesh is shown at first: of more, its lines would hide what is behind.
+_SPARSE = 8_000
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,10 @@ class View:
             target"; NaN where there is none. The first one is shown at first.
         units: displayed unit by name of a scalar.
         facts: displayed values by name, in plain text.
+        unit: displayed unit of coordinates, such as "mm"; empty where there is none to name.
+        verdict: one word on how far to trust the result; empty where nothing is said.
+        reasons: sentences for it.
+        explained: a sentence on what a scalar, a fact or the verdict means, by its name.
     """
 
     source: Surface
@@ -65,6 +72,10 @@ class View:
     scalars: Mapping[str, np.ndarray] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
+    unit: str = ""
+    verdict: str = ""
+    reasons: Sequence[str] = ()
+    explained: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_view(path: str | os.PathLike, view: View, *, overwrite: bool = False) -> None:
@@ -101,10 +112,9 @@ def write_view(path: str | os.PathLike, view: View, *, overwrite: bool = False) 
         lstrip_blocks=True,
     )
     page = environment.get_template("view.html").render(
-        title=view.title,
-        facts={name: str(value) for name, value in view.facts.items()},
+        view=view,
         layers=data["layers"],
-        names=[scalar["name"] for scalar in data["scalars"]],
+        sides=data["sides"],
         data=_embedded(data),
         licence=Markup(_resource("three.LICENSE.txt")),
         library=Markup(_resource("three.min.js")),
@@ -118,18 +128,26 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
     source, target = view.source, view.target
     small, rows = _light(source)
     small_target, target_rows = _light(target)
+    # Surfaces that cross each other look like a fault: the target's starts as lines, or hidden.
+    sparse = small_target.faces is None or len(small_target.faces) <= _SPARSE
     layers = [
         _layer("moved", "Moved source", source, rows, "#3f7fc4", opacity=100, shown=True),
-        _layer("target", "Target", target, target_rows, "#8794a3", opacity=35, shown=True),
-        _layer("source", "Source", source, rows, "#d08a3c", opacity=45, shown=False),
+        _layer("target", "Target", target, target_rows, "#4a5562", opacity=50, shown=sparse),
+        _layer("source", "Source", source, rows, "#d08a3c", opacity=60, shown=False),
     ]
+    for layer in layers:
+        drawn = small_target if layer["id"] == "target" else small
+        layer["mesh"] = drawn.faces is not None
+        layer["lines"] = layer["mesh"] and layer["id"] != "moved"
     shown = [
         _scalar(name, values, source, rows, view.units.get(name, ""))
+        | {"explained": view.explained.get(name, "")}
         for name, values in view.scalars.items()
     ]
     # Vertices that no face uses are not drawn, wherever they lie.
-    shown_target = target.vertices[target.used]
-    every = np.concatenate([source.vertices[source.used], shown_target, result[source.used]])
+    every = np.concatenate(
+        [source.vertices[source.used], target.vertices[target.used], result[source.used]]
+    )
     centre = (every.min(axis=0) + every.max(axis=0)) / 2
     radius = float(np.linalg.norm(every - centre, axis=1).max()) or 1.0
 
@@ -146,7 +164,10 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         "scalars": shown,
         "layers": layers,
         "colormap": _colors(),
-        "view": _viewpoint(shown_target),
+        "unit": view.unit,
+        "axes": axis_names(target.space),
+        "sides": sides(target.space),
+        "view": first_side(Surface(result, source.faces), target.space),
     }
 
 
@@ -207,7 +228,7 @@ def _layer(
 def _scalar(
     name: str, values: np.ndarray, source: Surface, rows: np.ndarray, unit: str
 ) -> dict[str, Any]:
-    """A scalar with the range of its colour bar and how many of all values it leaves out."""
+    """A scalar with its colours' range, how many values that leaves out, mean and largest."""
     values, count = np.asarray(values, dtype=np.float64), len(source.vertices)
     if values.shape != (count,):
         raise DataError(
@@ -217,8 +238,10 @@ def _scalar(
     drawn = values[source.used]
     known = drawn[np.isfinite(drawn)]
     low, high, over = 0.0, 1.0, 0
+    mean = largest = None
     if known.size:
         low, high = float(known.min()), float(known.max())
+        mean, largest = float(known.mean()), high
         usual = float(np.quantile(known, _SHOWN))
         if high - low > _STRETCH * (usual - low) > 0:
             high, over = usual, int((known > usual).sum())
@@ -232,6 +255,8 @@ def _scalar(
         "low": low,
         "high": high,
         "over": over,
+        "mean": mean,
+        "largest": largest,
         "missing": int(drawn.size - known.size),
         "values": _array(np.where(np.isfinite(values), values, np.nan)[rows], "float32"),
     }
@@ -254,16 +279,6 @@ def _array(array: np.ndarray, kind: str) -> dict[str, str]:
 
 def _colors() -> list[str]:
     return [f"#{color}" for color in _COLORS.split()]
-
-
-def _viewpoint(vertices: np.ndarray) -> dict[str, list[float]]:
-    """From the side on which the shape is broadest, a little from above and from one side."""
-    spread = np.ptp(vertices, axis=0)
-    thin = int(spread.argmin())
-    up = 1 if thin == 2 else 2  # images have y upwards, bodies and rooms z
-    direction = np.full(3, 0.25)
-    direction[thin] = 1.0
-    return {"direction": direction.tolist(), "up": np.eye(3)[up].tolist()}
 
 
 def _embedded(data: dict[str, Any]) -> Markup:

@@ -11,6 +11,7 @@ import pytest
 from dine.data.synthetic import primitive
 from dine.errors import DataError, StorageError
 from dine.geometry.surface import Surface
+from dine.viewer.sides import axis_names, first_side, sides
 from dine.viewer.view import View, _colors, write_view
 
 SOURCE = primitive(0, 0)
@@ -122,6 +123,8 @@ def test_controls_can_be_reached_and_named(tmp_path):
     assert page.of("option") == [*SCALARS, "one plain colour"]
     for key in ("opacity-moved", "opacity-target", "opacity-source"):
         assert "Opacity" in page.ids[key]["aria-label"]
+    assert page.ids["lines-moved"]["aria-pressed"] == "false"
+    assert "lines-target" not in page.ids  # a cloud
     assert page.of("dt") == ["Seed"]
     assert page.of("dd") == ["0"]
     assert "WebGL" in page.of("script")[-1]
@@ -139,11 +142,16 @@ def test_hostile_names_stay_text(tmp_path):
         scalars={HOSTILE: SCALARS["distance"]},
         units={HOSTILE: HOSTILE},
         facts={HOSTILE: HOSTILE},
+        unit=HOSTILE,
+        verdict=HOSTILE,
+        reasons=[HOSTILE],
+        explained={"verdict": HOSTILE},
     )
     assert len(page.of("script")) == len(plain.of("script"))
     assert page.addresses == []
-    for tag in ("title", "h1", "dt", "dd"):
+    for tag in ("title", "h1", "dt", "dd", "li", "strong"):
         assert page.of(tag) == [HOSTILE]
+    assert page.ids["verdict"]["class"] == HOSTILE
     assert page.data()["scalars"][0]["name"] == HOSTILE
     assert page.data()["scalars"][0]["unit"] == HOSTILE
 
@@ -173,6 +181,9 @@ def test_scales(tmp_path):
     assert ranges["zero"] == ranges["none"] == (0, 1)
     assert ranges["outlier"][1] < 5
     assert found["outlier"]["over"] == pytest.approx(0.01 * COUNT, abs=1)
+    assert (found["gaps"]["mean"], found["gaps"]["largest"]) == pytest.approx((3, 5), abs=0.1)
+    assert found["outlier"]["largest"] == 1e6
+    assert found["none"]["mean"] is None
     assert [found[name]["missing"] for name in ("gaps", "none", "infinite")] == [7, COUNT, 2]
     assert np.isnan(decode(found["gaps"]["values"])[:7]).all()
 
@@ -272,3 +283,48 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(StorageError, match="exists already"):
         view(tmp_path / "a.html")
     view(tmp_path / "a.html", overwrite=True)
+
+
+def test_a_dense_target_is_hidden_at_first(tmp_path):
+    for side, shown in ((30, True), (80, False)):
+        mesh = sheet(side)
+        view(tmp_path / f"{side}.html", source=mesh, target=mesh, result=mesh.vertices)
+        page = Page((tmp_path / f"{side}.html").read_text(encoding="utf-8"))
+        assert ("checked" in page.ids["show-target"]) == shown
+        assert page.ids["lines-target"]["aria-pressed"] == "true"
+        assert "checked" in page.ids["show-moved"]
+
+
+@pytest.mark.parametrize(
+    ("size", "direction", "up"),
+    [
+        ([3, 2, 1], [0, 0, 1], [0, 1, 0]),
+        ([3, 1, 2], [0, -1, 0], [0, 0, 1]),
+        ([1, 2, 3], [1, 0, 0], [0, 0, 1]),
+        ([1, 3, 2], [1, 0, 0], [0, 1, 0]),
+    ],
+)
+def test_the_first_side_is_the_broadest(size, direction, up):
+    side = first_side(Surface(SOURCE.vertices / np.ptp(SOURCE.vertices, axis=0) * size), None)
+    assert side == {"direction": direction, "up": up}
+
+
+def test_the_first_side_is_where_an_open_surface_faces():
+    for faces, direction in ((sheet(9).faces, [0, 0, 1]), (sheet(9).faces[:, ::-1], [0, 0, -1])):
+        assert first_side(Surface(sheet(9).vertices, faces), None)["direction"] == direction
+
+
+def test_patients_are_looked_at_from_the_front():
+    assert first_side(SOURCE, "LPS") == {"direction": [0, -1, 0], "up": [0, 0, 1]}
+    assert first_side(SOURCE, "RAS") == {"direction": [0, 1, 0], "up": [0, 0, 1]}
+    for space, fronts in (("LPS", -1), ("RAS", 1)):
+        named = {side["name"]: side for side in sides(space)}
+        assert named["front"]["direction"] == [0, fronts, 0]
+        assert named["head"]["direction"] == named["left"]["up"] == [0, 0, 1]
+        assert named["head"]["up"] == named["front"]["direction"]
+        assert named["left"]["direction"] == [-fronts, 0, 0]
+        assert axis_names(space) == list(space)
+    assert [side["name"] for side in sides(None)] == ["−x", "+x", "−y", "+y", "−z", "+z"]
+    assert axis_names(None) == ["x", "y", "z"]
+    for space in ("LPS", "RAS", None):
+        assert all(np.dot(side["direction"], side["up"]) == 0 for side in sides(space))
