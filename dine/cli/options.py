@@ -76,9 +76,9 @@ def out_option(help: str, type: click.ParamType = OUT):
     return click.option("--out", type=type, required=True, help=help)
 
 
-def own_out_option(help: str, type: click.ParamType = OUT):
+def own_out_option(help: str, type: click.ParamType = OUT, required: bool = True):
     """Where a command on one's own scans writes to."""
-    return click.option("-o", "--out", type=type, required=True, help=help)
+    return click.option("-o", "--out", type=type, required=required, help=help)
 
 
 json_option = click.option(

@@ -14,6 +14,7 @@ from dine.cli.console import tell
 from dine.cli.options import (
     FOLDER,
     IN,
+    OUT,
     OUT_FOLDER,
     compute_flags,
     compute_options,
@@ -129,6 +130,47 @@ overwrite_option = click.option(
 )
 
 
+def _grids(**given):
+    """The grids to write, when it is called: what they are made with is not imported before."""
+
+    def make():
+        from dine.registration.grid import GridFiles
+
+        return GridFiles(**given)
+
+    return make
+
+
+grid_options = gathered(
+    "grids",
+    _grids,
+    click.option(
+        "--grid",
+        "forward",
+        type=OUT,
+        help="Also write the displacement, source to target, on a grid: .nrrd or .mha (LPS).",
+    ),
+    click.option(
+        "--grid-inverse",
+        "inverse",
+        type=OUT,
+        help="The same back, target to source: what images of the source are resampled by.",
+    ),
+    click.option("--grid-spacing", "spacing", type=float, help="By default a 64th of the size."),
+    click.option(
+        "--grid-margin",
+        "margin",
+        type=float,
+        help="Beyond the source's box; by default a tenth of its size.",
+    ),
+    click.option(
+        "--space",
+        type=click.Choice(["lps", "ras"], case_sensitive=False),
+        help="Coordinates of the scans, for the grid; by default as their files state, or lps.",
+    ),
+)
+
+
 @dataclass(frozen=True)
 class _Writing:
     """What `dine register` is to write, and how it is to tell of that."""
@@ -174,7 +216,8 @@ class _Writing:
 )
 @registration_options
 @model_options
-def register(source, target, further, settings, writing, load_model):
+@grid_options
+def register(source, target, further, settings, writing, load_model, grids):
     """Move SOURCE onto TARGET: any mesh or point file, any number of points, any units.
 
     Beside the moved source OUT go the displacement of every vertex (OUT.field.npz, OUT.field.vtp),
@@ -193,8 +236,9 @@ def register(source, target, further, settings, writing, load_model):
         shapes, landmarks = shapes_by_name(further["apply"]), further["landmarks"]
         outputs = Outputs(writing.out)
         outputs.check(shapes, view=writing.view, overwrite=writing.overwrite)
-        moving = read_surface(source)
+        moving, grids = read_surface(source), grids()
         check_holds(writing.out, moving)
+        grids.check(moving, overwrite=writing.overwrite)
         marks = landmarks or None
         result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
         stages.begin("writing")
@@ -235,30 +279,45 @@ def _facts(result: RegistrationResult, said: list[str]) -> dict[str, Any]:
     \b
     dine apply moved.ply tumour.stl vessels.vtp -o moved
     dine apply results/scans/first landmarks.fcsv -o moved
+    dine apply moved.ply --grid field.nrrd
     """
 )
 @click.argument("result", type=click.Path(exists=False, path_type=Path))
-@click.argument("files", nargs=-1, required=True, type=IN)
-@own_out_option("Folder of the moved files.", OUT_FOLDER)
+@click.argument("files", nargs=-1, type=IN)
+@own_out_option("Folder of the moved files.", OUT_FOLDER, required=False)
 @click.option("--suffix", default="", help="Format to write, such as .ply; by default their own.")
 @overwrite_option
 @json_option
-def apply(result, files, out, suffix, overwrite, as_json):
+@grid_options
+def apply(result, files, out, suffix, overwrite, as_json, grids):
     """Move FILES, which lie in the source's coordinates, as RESULT moved its source.
 
-    RESULT is a file that `dine register` wrote (such as moved.ply), or its folder.
+    RESULT is a file that `dine register` wrote (such as moved.ply), or its folder. With --grid
+    FILES may be left out.
     """
-    from dine.registration.output import move_files
-    from dine.registration.saved import load_result
+    grids = grids()
+    if files and out is None:
+        raise click.UsageError("Missing option '-o' / '--out', the folder of the moved files.")
+    if not (files or grids.files):
+        raise click.UsageError("Name FILES to move, or a file for --grid.")
+    with Stages() as stages:
+        stages.begin("reading")
+        start_torch()
+        from dine.registration.output import move_files
+        from dine.registration.saved import load_result
 
-    start_torch()
-    moved = list(move_files(load_result(result), files, out, suffix=suffix, overwrite=overwrite))
+        found = load_result(result)
+        grids.check(found.source, overwrite=overwrite)
+        stages.begin("moving")
+        moved = list(move_files(found, files, out, suffix=suffix, overwrite=overwrite))
+        notes = grids.write(found, overwrite=overwrite)
     lines = [line for path, said in moved for line in (str(path), *(f"  {x}" for x in said))]
+    lines += [*map(str, grids.files.values()), *(f"  {x}" for x in notes)]
     facts = [
         {"source": file, "moved": path, "notes": said}
         for file, (path, said) in zip(files, moved, strict=True)
     ]
-    tell(lines, {"files": facts}, as_json)
+    tell(lines, {"files": facts, **grids.files, "notes": notes}, as_json)
 
 
 @click.command(

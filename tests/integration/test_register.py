@@ -550,9 +550,11 @@ def test_command_tells_programs_and_the_log(files, tmp_path):
     """One JSON object on stdout and nothing else; what is printed otherwise is in the log."""
     out, log = tmp_path / "moved.ply", tmp_path / "log"
     options = ("--points", 64, "--json", "-q", "--apply", files[0])
+    options += ("--grid", tmp_path / "moved.nrrd", "--grid-inverse", tmp_path / "moved.back.mha")
+    options += ("--grid-spacing", 0.4)
     done = run("--log", log, "register", *files, "-o", out, *options)
     assert done.exit_code == 0, done.output
-    told = json.loads(done.output)
+    told = json.loads(done.stdout)
     report = json.loads(out.with_suffix(".json").read_text())
     assert told["verdict"] == report["trust"]["verdict"]
     assert told["reasons"] == report["trust"]["reasons"]
@@ -686,7 +688,7 @@ def test_many_pairs_go_on_where_they_stopped(files, tmp_path):
     (tmp_path / "missing.ply").write_bytes(files[0].read_bytes())
     done = run("-q", *arguments, "--json")
     assert done.exit_code == 0
-    told = json.loads(done.output)
+    told = json.loads(done.stdout)
     assert (told["registered"], told["failed"]) == (2, 0)
     assert told["pairs"][0]["verdict"] == summary.loc["first", "verdict"]
     assert told["pairs"][0]["hd95_after"] == pytest.approx(summary.loc["first", "hd95_after"])

@@ -174,7 +174,7 @@ def test_apply_moves_files_later(result, tmp_path):
     assert isinstance(done.exception, StorageError)
     more = ("-o", tmp_path / "out", "--suffix", ".vtp", "--overwrite")
     done = run("apply", tmp_path / "run" / "moved.json", *files, *more, "--json")
-    told = json.loads(done.output)["files"]
+    told = json.loads(done.stdout)["files"]
     assert [Path(one["source"]) for one in told] == list(files)
     assert Path(told[1]["moved"]) == tmp_path / "out" / "marks.vtp"
     assert "33 % of its points" in told[1]["notes"][0]
