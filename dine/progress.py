@@ -5,12 +5,92 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from typing import Any
 
 from tqdm import tqdm
 
 log = logging.getLogger("dine")
 
 LOG_SECONDS = 10.0
+ELSEWHERE: dict[str, Any] = {"elsewhere": True}
+"""``extra`` of a line of the log that the person at the terminal sees in another way."""
+
+_hidden = False
+_watching: Stages | None = None
+
+
+def hide(hidden: bool = True) -> None:
+    """Show no bars from here on, or show them again."""
+    global _hidden
+    _hidden = hidden
+
+
+def hidden() -> bool:
+    """Whether the person who started this wants to see results and errors only."""
+    return _hidden
+
+
+def stage(name: str) -> None:
+    """Say that a stage of a task begins, to the :class:`Stages` that are open, if any."""
+    if _watching is not None:
+        _watching.begin(name)
+
+
+def remark(text: str) -> None:
+    """Say why something takes longer than it usually does."""
+    if _watching is not None:
+        _watching.remark(text)
+    else:
+        log.info(text)
+
+
+def _line(quiet: bool = False, **settings: Any) -> tqdm:
+    """A bar, or a line that changes; disabled where nobody watches."""
+    off = quiet or _hidden or not sys.stderr.isatty()
+    return tqdm(disable=off, dynamic_ncols=True, leave=False, **settings)
+
+
+class Stages:
+    """Stages of one task: a line that changes on a terminal, otherwise a line of the log for each.
+
+    Use as a context manager. While it is open, :func:`stage` and :func:`remark` anywhere below it
+    reach it.
+    """
+
+    def __init__(self):
+        self._shown = _line(bar_format="{desc}")
+        self._name, self._began = "", time.monotonic()
+
+    def __enter__(self) -> Stages:
+        global _watching
+        _watching = self
+        return self
+
+    def begin(self, name: str) -> None:
+        """Go on to a stage; nothing if it is the one that is under way."""
+        if name == self._name:
+            return
+        self._end()
+        self._name, self._began = name, time.monotonic()
+        self._say(name)
+
+    def remark(self, text: str) -> None:
+        """Say something of the stage that is under way."""
+        self._say(f"{self._name}: {text}")
+
+    def _say(self, text: str) -> None:
+        log.info(text, extra=None if self._shown.disable else ELSEWHERE)
+        self._shown.set_description_str(f"{text} …")
+
+    def _end(self) -> None:
+        if self._name:
+            log.debug("%s took %.2f s", self._name, time.monotonic() - self._began)
+
+    def __exit__(self, *error) -> None:
+        global _watching
+        _watching = None
+        self._end()
+        self._shown.close()
 
 
 class Progress:
@@ -24,15 +104,7 @@ class Progress:
         self, name: str, total: int, done: int = 0, unit: str = "step", quiet: bool = False
     ):
         self.name, self.total, self.done, self.unit = name, total, done, unit
-        self._bar = tqdm(
-            total=total,
-            initial=done,
-            desc=name,
-            unit=unit,
-            disable=quiet or not sys.stderr.isatty(),
-            dynamic_ncols=True,
-            leave=False,
-        )
+        self._bar = _line(quiet, total=total, initial=done, desc=name, unit=unit)
         self._first, self._start = done, time.monotonic()
         self._logged = self._start
 

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
 
 from dine import config
-from dine.cli.options import IN, OUT_FOLDER, out_option, pairs_option, seed_option, settings_option
+from dine.cli.console import tell
+from dine.cli.options import (
+    IN,
+    OUT_FOLDER,
+    json_option,
+    out_option,
+    pairs_option,
+    seed_option,
+    settings_option,
+)
 from dine.files import write_json
 
 
 @click.command()
 @click.argument("folder", type=click.Path(path_type=Path))
-def inspect(folder: Path):
+@json_option
+def inspect(folder: Path, as_json: bool):
     """List what a folder of meshes holds, per condition and level, and what is left out and why.
 
     A manifest (CSV) of pairs will do as well.
@@ -23,14 +34,21 @@ def inspect(folder: Path):
     from dine.data.layout import scan
 
     inventory = scan(folder)
-    if inventory.has_pairs:
-        click.echo(inventory.table().to_string(index=False))
+    table = inventory.table() if inventory.has_pairs else None
+    if table is None:
+        lines = [f"{len(inventory.bases)} undeformed objects; targets would be made from them."]
     else:
-        click.echo(f"{len(inventory.bases)} undeformed objects; targets would be made from them.")
+        lines = table.to_string(index=False).splitlines()
     if inventory.split_file:
-        click.echo(f"Split file: {inventory.split_file}")
-    for path, reason in inventory.left_out:
-        click.echo(f"left out: {path}: {reason}")
+        lines.append(f"Split file: {inventory.split_file}")
+    lines += [f"left out: {path}: {reason}" for path, reason in inventory.left_out]
+    facts = {
+        "pairs": [] if table is None else json.loads(table.to_json(orient="records")),
+        "undeformed": len(inventory.bases),
+        "split_file": inventory.split_file,
+        "left_out": [{"file": path, "reason": reason} for path, reason in inventory.left_out],
+    }
+    tell(lines, facts, as_json)
 
 
 @click.command()

@@ -9,9 +9,8 @@ from dine.cli.options import (
     IN,
     OUT,
     SectionType,
-    batch_option,
-    compute_options,
     gathered,
+    inference_options,
     json_or_file,
     model_option,
     name_option,
@@ -28,11 +27,9 @@ from dine.errors import ConfigError
 @model_option
 @pairs_option
 @variants_option
-@batch_option
-@compute_options("device", "precision")
-@name_option
+@inference_options("predict")
 @out_option("Predictions to write (HDF5).")
-def predict(model, pairs, variants, batch_size, compute, name, out):
+def predict(model, pairs, variants, inference, out):
     """Register the test split and its corrupted variants; write the displacement fields.
 
     Example: dine predict --model model.safetensors --pairs pairs.h5 --out predictions.h5
@@ -40,15 +37,7 @@ def predict(model, pairs, variants, batch_size, compute, name, out):
     from dine.evaluation.predict import predict as run
 
     start_torch()
-    run(
-        model,
-        pairs,
-        list(variants),
-        out,
-        name=name or "predict",
-        batch_size=batch_size,
-        compute=compute,
-    )
+    run(model, pairs, list(variants), out, **inference)
 
 
 @click.command()

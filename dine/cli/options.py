@@ -81,6 +81,14 @@ def out_option(help: str, type: click.ParamType = OUT):
     return click.option("--out", type=type, required=True, help=help)
 
 
+def own_out_option(help: str, type: click.ParamType = OUT, required: bool = True):
+    """Where a command on one's own scans writes to."""
+    return click.option("-o", "--out", type=type, required=required, help=help)
+
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print the result as one JSON object."
+)
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 name_option = click.option("--name", default="", help="Shown with the progress.")
 batch_option = click.option(
@@ -147,10 +155,24 @@ def compute_options(*names: str) -> Callable:
     return gathered("compute", config.Compute, *compute_flags(*names))
 
 
+def inference_options(called: str) -> Callable:
+    """How to run a network over pairs, given as ``inference``; ``called`` where it has no name."""
+
+    def make(batch_size: int, name: str, **compute: Any) -> dict[str, Any]:
+        how = {"batch_size": batch_size, "compute": config.Compute(**compute)}
+        return how | {"name": name or called}
+
+    options = [batch_option, *compute_flags("device", "precision"), name_option]
+    return gathered("inference", make, *options)
+
+
 def start_torch() -> None:
     """Import torch, with the number of threads that was asked for."""
     import torch
 
+    from dine.cli.compiling import say_when_compiling
+
     threads = os.environ.get("OMP_NUM_THREADS")
     if threads:
         torch.set_num_threads(int(threads))
+    say_when_compiling()

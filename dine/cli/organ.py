@@ -8,7 +8,8 @@ from pathlib import Path
 import click
 
 from dine import __version__, config
-from dine.cli.options import IN, OUT, gathered, seed_option, settings_option
+from dine.cli.console import tell
+from dine.cli.options import IN, gathered, own_out_option, seed_option, settings_option
 
 
 def _simulation(fields: int | None, settings: config.Simulation) -> config.Simulation:
@@ -17,7 +18,7 @@ def _simulation(fields: int | None, settings: config.Simulation) -> config.Simul
 
 @click.command()
 @click.argument("template", type=IN)
-@click.option("-o", "--out", type=OUT, required=True, help="Fields to write (HDF5).")
+@own_out_option("Fields to write (HDF5).")
 @gathered(
     "known",
     dict,
@@ -55,16 +56,14 @@ def simulate(template, out, known, settings, seed, workers):
     )
     facts = {"seed": seed, "settings": settings.model_dump_json(), "version": __version__}
     write_deformations(out, found, facts)
-    click.echo(
-        f"{out}: {len(found.vertices)} fields of {len(surface.vertices)} vertices and "
-        f"{len(found.nodes[0])} nodes"
-    )
+    counts = f"{len(surface.vertices)} vertices and {len(found.nodes[0])} nodes"
+    tell([f"{out}: {len(found.vertices)} fields of {counts}"])
 
 
 @click.command()
 @click.argument("template", type=IN)
 @click.argument("fields", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=OUT, required=True, help="Prior to write (HDF5).")
+@own_out_option("Prior to write (HDF5).")
 @settings_option(config.OrganLearning)
 @seed_option
 def learn(template, fields, out, settings, seed):
@@ -85,7 +84,6 @@ def learn(template, fields, out, settings, seed):
     ]
     prior = run(surface, sets, settings, seed=seed)
     prior.save(out)
-    click.echo(
-        f"{out}: {len(prior.modes)} components of {prior.facts['fields']} fields, and a process of "
-        f"{', '.join(f'{x:.3f}' for x in prior.amplitudes)} radii"
-    )
+    radii = ", ".join(f"{x:.3f}" for x in prior.amplitudes)
+    found = f"{len(prior.modes)} components of {prior.facts['fields']} fields"
+    tell([f"{out}: {found}, and a process of {radii} radii"])

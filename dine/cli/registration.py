@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from dine.cli.console import tell
 from dine.cli.options import (
     FOLDER,
     IN,
@@ -15,33 +19,19 @@ from dine.cli.options import (
     compute_flags,
     compute_options,
     gathered,
+    json_option,
     model_option,
     out_option,
+    own_out_option,
     several_pairs_option,
     start_torch,
     targets_option,
 )
 from dine.errors import ConfigError, DataError
+from dine.progress import Stages
 
-
-@click.command()
-@click.argument("folder", type=FOLDER, default=".")
-def scans(folder: Path):
-    """Write before.ply and after.ply, two small synthetic scans of one organ, to try things with.
-
-    Example: dine scans trial
-    """
-    from importlib import resources
-
-    from dine.files import atomic_path
-
-    for name in ("before.ply", "after.ply"):
-        if (folder / name).exists():
-            raise DataError(f"{folder / name} is there already; name another folder.")
-    for name in ("before.ply", "after.ply"):
-        with atomic_path(folder / name) as temporary:
-            temporary.write_bytes((resources.files("dine") / "scans" / name).read_bytes())
-    click.echo(f"{folder / 'before.ply'}, {folder / 'after.ply'}")
+if TYPE_CHECKING:
+    from dine.registration.types import RegistrationResult
 
 
 def _loader(backbone, weights, prior, calibration, precision):
@@ -135,6 +125,60 @@ registration_options = gathered(
     *compute_flags("device"),
 )
 view_option = click.option("--view", is_flag=True, help="Also write a page to turn and overlay.")
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace files that are there already."
+)
+
+
+def _grids(**given):
+    """The grids to write, when it is called: what they are made with is not imported before."""
+
+    def make():
+        from dine.registration.grid import GridFiles
+
+        return GridFiles(**given)
+
+    return make
+
+
+grid_options = gathered(
+    "grids",
+    _grids,
+    click.option(
+        "--grid",
+        "forward",
+        type=OUT,
+        help="Also write the displacement, source to target, on a grid: .nrrd or .mha (LPS).",
+    ),
+    click.option(
+        "--grid-inverse",
+        "inverse",
+        type=OUT,
+        help="The same back, target to source: what images of the source are resampled by.",
+    ),
+    click.option("--grid-spacing", "spacing", type=float, help="By default a 64th of the size."),
+    click.option(
+        "--grid-margin",
+        "margin",
+        type=float,
+        help="Beyond the source's box; by default a tenth of its size.",
+    ),
+    click.option(
+        "--space",
+        type=click.Choice(["lps", "ras"], case_sensitive=False),
+        help="Coordinates of the scans, for the grid; by default as their files state, or lps.",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class _Writing:
+    """What `dine register` is to write, and how it is to tell of that."""
+
+    out: Path
+    view: bool
+    overwrite: bool
+    as_json: bool
 
 
 @click.command(
@@ -149,7 +193,14 @@ view_option = click.option("--view", is_flag=True, help="Also write a page to tu
 )
 @click.argument("source", type=IN)
 @click.argument("target", type=IN)
-@click.option("-o", "--out", type=OUT, required=True, help="The moved source; suffix says how.")
+@gathered(
+    "writing",
+    _Writing,
+    own_out_option("The moved source; suffix says how."),
+    view_option,
+    overwrite_option,
+    json_option,
+)
 @gathered(
     "further",
     dict,
@@ -164,45 +215,61 @@ view_option = click.option("--view", is_flag=True, help="Also write a page to tu
     ),
 )
 @registration_options
-@gathered(
-    "writing",
-    dict,
-    view_option,
-    click.option("--overwrite", is_flag=True, help="Replace files that are there already."),
-)
 @model_options
-def register(source, target, out, further, settings, writing, load_model):
+@grid_options
+def register(source, target, further, settings, writing, load_model, grids):
     """Move SOURCE onto TARGET: any mesh or point file, any number of points, any units.
 
     Beside the moved source OUT go the displacement of every vertex (OUT.field.npz, OUT.field.vtp),
     what `dine apply` needs (OUT.result.npz), a report (OUT.json) and, with --view, a page to look
     at (OUT.html).
     """
-    from dine.io.readers import read_surface
-    from dine.io.writers import check_holds
-    from dine.registration.output import Outputs, save
-    from dine.registration.register import register as run
-    from dine.registration.shapes import shapes_by_name
+    with Stages() as stages:
+        stages.begin("reading")
+        start_torch()
+        from dine.io.readers import read_surface
+        from dine.io.writers import check_holds
+        from dine.registration.output import Outputs, save
+        from dine.registration.register import register as run
+        from dine.registration.shapes import shapes_by_name
 
-    start_torch()
-    shapes, landmarks = shapes_by_name(further["apply"]), further["landmarks"]
-    outputs = Outputs(out)
-    outputs.check(shapes, **writing)
-    moving = read_surface(source)
-    check_holds(out, moving)
-    marks = landmarks or None
-    result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
-    said = save(result, outputs, applied=shapes, **writing)
-    report = result.report
-    expected = result.trust.expected_error
-    click.echo(
+        shapes, landmarks = shapes_by_name(further["apply"]), further["landmarks"]
+        outputs = Outputs(writing.out)
+        outputs.check(shapes, view=writing.view, overwrite=writing.overwrite)
+        moving, grids = read_surface(source), grids()
+        check_holds(writing.out, moving)
+        grids.check(moving, overwrite=writing.overwrite)
+        marks = landmarks or None
+        result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
+        stages.begin("writing")
+        said = save(result, outputs, applied=shapes, view=writing.view, overwrite=writing.overwrite)
+    files = outputs.files(view=writing.view)
+    files |= {"applied": {name: outputs.applied(name, path) for name, path in shapes.items()}}
+    lines = [_line(writing.out, result), *(f"  {x}" for x in (*result.trust.reasons, *said))]
+    tell(lines, _facts(result, said) | {"files": files}, writing.as_json)
+
+
+def _line(out: Path, result: RegistrationResult) -> str:
+    """What came of a registration, in one line."""
+    report, expected = result.report, result.trust.expected_error
+    return (
         f"{out}: HD95 {report['before']['hd95']:.4g} -> {report['after']['hd95']:.4g}, "
         f"{result.trust.verdict}"
         + (f", expected error {expected:.3g}" if expected is not None else "")
         + f" ({report['seconds']:.1f} s)"
     )
-    for sentence in (*result.trust.reasons, *said):
-        click.echo(f"  {sentence}")
+
+
+# Of the report; the file holds the rest.
+_TOLD = ("before", "aligned", "after", "displacement", "folding", "landmarks", "seconds")
+
+
+def _facts(result: RegistrationResult, said: list[str]) -> dict[str, Any]:
+    """What came of a registration, for programs; names as in the report."""
+    trust = result.trust
+    facts = {"verdict": trust.verdict, "reasons": trust.reasons, "notes": said}
+    facts |= {"expected_error": trust.expected_error}
+    return facts | {name: result.report[name] for name in _TOLD if name in result.report}
 
 
 @click.command(
@@ -212,24 +279,45 @@ def register(source, target, out, further, settings, writing, load_model):
     \b
     dine apply moved.ply tumour.stl vessels.vtp -o moved
     dine apply results/scans/first landmarks.fcsv -o moved
+    dine apply moved.ply --grid field.nrrd
     """
 )
 @click.argument("result", type=click.Path(exists=False, path_type=Path))
-@click.argument("files", nargs=-1, required=True, type=IN)
-@click.option("-o", "--out", type=OUT_FOLDER, required=True, help="Folder of the moved files.")
+@click.argument("files", nargs=-1, type=IN)
+@own_out_option("Folder of the moved files.", OUT_FOLDER, required=False)
 @click.option("--suffix", default="", help="Format to write, such as .ply; by default their own.")
-@click.option("--overwrite", is_flag=True, help="Replace files that are there already.")
-def apply(result, files, out, suffix, overwrite):
+@overwrite_option
+@json_option
+@grid_options
+def apply(result, files, out, suffix, overwrite, as_json, grids):
     """Move FILES, which lie in the source's coordinates, as RESULT moved its source.
 
-    RESULT is a file that `dine register` wrote (such as moved.ply), or its folder.
+    RESULT is a file that `dine register` wrote (such as moved.ply), or its folder. With --grid
+    FILES may be left out.
     """
-    from dine.registration.output import move_files
-    from dine.registration.saved import load_result
+    grids = grids()
+    if files and out is None:
+        raise click.UsageError("Missing option '-o' / '--out', the folder of the moved files.")
+    if not (files or grids.files):
+        raise click.UsageError("Name FILES to move, or a file for --grid.")
+    with Stages() as stages:
+        stages.begin("reading")
+        start_torch()
+        from dine.registration.output import move_files
+        from dine.registration.saved import load_result
 
-    start_torch()
-    for line in move_files(load_result(result), files, out, suffix=suffix, overwrite=overwrite):
-        click.echo(line)
+        found = load_result(result)
+        grids.check(found.source, overwrite=overwrite)
+        stages.begin("moving")
+        moved = list(move_files(found, files, out, suffix=suffix, overwrite=overwrite))
+        notes = grids.write(found, overwrite=overwrite)
+    lines = [line for path, said in moved for line in (str(path), *(f"  {x}" for x in said))]
+    lines += [*map(str, grids.files.values()), *(f"  {x}" for x in notes)]
+    facts = [
+        {"source": file, "moved": path, "notes": said}
+        for file, (path, said) in zip(files, moved, strict=True)
+    ]
+    tell(lines, {"files": facts, **grids.files, "notes": notes}, as_json)
 
 
 @click.command(
@@ -243,12 +331,12 @@ def apply(result, files, out, suffix, overwrite):
     """,
 )
 @click.argument("manifest", type=click.Path(exists=False, path_type=Path))
-@click.option("-o", "--out", type=OUT_FOLDER, required=True, help="Folder of all results.")
+@own_out_option("Folder of all results.", OUT_FOLDER)
 @click.option("--suffix", default="", help="Format of the moved sources, such as .ply.")
 @registration_options
-@view_option
+@gathered("shown", dict, view_option, json_option)
 @model_options
-def register_many(manifest, out, suffix, settings, view, load_model):
+def register_many(manifest, out, suffix, settings, shown, load_model):
     """Register every pair of MANIFEST, a CSV file (source, target, name) or a folder.
 
     A pair that fails is reported and does not stop the others; run the same command again to go on
@@ -262,11 +350,36 @@ def register_many(manifest, out, suffix, settings, view, load_model):
     if "prior" in loaded:
         raise ConfigError(f"{loaded['prior']} is the prior of an organ; `dine register` takes it.")
     jobs = read_jobs(manifest)
+    view = shown["view"]
     summary = run(jobs, out, loaded["model"], suffix=suffix, view=view, settings=settings)
-    failed = int((summary["state"] == "failed").sum())
-    click.echo(f"{len(summary) - failed} of {len(summary)} registered; {out / 'summary.csv'}")
+    failed, table = int((summary["state"] == "failed").sum()), out / "summary.csv"
+    done = len(summary) - failed
+    # Through text, in which what is missing has no number.
+    pairs = json.loads(summary.to_json(orient="records", double_precision=15))
+    facts = {"registered": done, "failed": failed, "summary": table, "pairs": pairs}
+    tell([f"{done} of {len(summary)} registered; {table}"], facts, shown["as_json"])
     if failed:
         sys.exit(1)
+
+
+@click.command()
+@click.argument("folder", type=FOLDER, default=".")
+def scans(folder: Path):
+    """Write before.ply and after.ply, two small synthetic scans of one organ, to try things with.
+
+    Example: dine scans trial
+    """
+    from importlib import resources
+
+    from dine.files import atomic_path
+
+    for name in ("before.ply", "after.ply"):
+        if (folder / name).exists():
+            raise DataError(f"{folder / name} is there already; name another folder.")
+    for name in ("before.ply", "after.ply"):
+        with atomic_path(folder / name) as temporary:
+            temporary.write_bytes((resources.files("dine") / "scans" / name).read_bytes())
+    tell([f"{folder / 'before.ply'}, {folder / 'after.ply'}"])
 
 
 @click.command()

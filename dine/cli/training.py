@@ -12,11 +12,10 @@ from dine.cli.options import (
     IN,
     OUT_FOLDER,
     SectionType,
-    batch_option,
     compute_flags,
-    compute_options,
     default_of,
     gathered,
+    inference_options,
     model_option,
     name_option,
     out_option,
@@ -95,11 +94,9 @@ def pretrain(pairs, targets, backbone, settings, order):
 @model_option
 @pairs_option
 @click.option("--targets", type=IN, help="Of `resample`; seen instead of the pairs' own.")
-@batch_option
-@compute_options("device", "precision")
-@name_option
+@inference_options("fields")
 @out_option("Fields to write (HDF5).")
-def fields(model, pairs, targets, batch_size, compute, name, out):
+def fields(model, pairs, targets, inference, out):
     """Write a model's displacement fields of the training split.
 
     Example: dine fields --model model.safetensors --pairs pairs.h5 --out dvf.h5
@@ -107,15 +104,7 @@ def fields(model, pairs, targets, batch_size, compute, name, out):
     from dine.models.inference import dump_fields
 
     start_torch()
-    dump_fields(
-        model,
-        pairs,
-        out,
-        name=name or "fields",
-        batch_size=batch_size,
-        targets=targets,
-        compute=compute,
-    )
+    dump_fields(model, pairs, out, targets=targets, **inference)
 
 
 @click.command("fit-prior")

@@ -73,7 +73,10 @@ def check_output(
     if path.is_dir():
         raise StorageError(f"{path} is a folder; name a file in it.")
     if path.exists() and not overwrite:
-        raise StorageError(f"{path} exists already; choose another name, or allow overwriting it.")
+        raise StorageError(
+            f"{path} exists already; choose another name, or replace it (--overwrite, in Python "
+            "overwrite=True)."
+        )
 
 
 def check_holds(path: str | os.PathLike, surface: Surface) -> None:

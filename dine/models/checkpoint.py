@@ -106,9 +106,11 @@ def shipped_weights(kind: str) -> Path:
     """
     path = WEIGHTS / f"{kind}.safetensors"
     if not path.is_file():
+        shipped = sorted(found.stem for found in WEIGHTS.glob("*.safetensors"))
+        names = " and ".join(name for name in shipped if "." not in name)
         raise ConfigError(
-            f"There are no pretrained weights for the backbone {kind!r}; set `stage1.start` to "
-            "random or to a file of weights."
+            f"There are no pretrained weights for the backbone {kind!r}, only for {names}; name a "
+            "file of weights instead (--weights, `stage1.start`), or train from random ones."
         )
     return path
 

@@ -55,6 +55,13 @@ class Outputs:
     def view(self) -> Path:
         return self.beside("html")
 
+    def files(self, *, view: bool) -> dict[str, Path]:
+        """All but further shapes, by what they hold."""
+        found = {"moved": self.moved, "field": self.beside("field.npz")}
+        found |= {"field_vtp": self.beside("field.vtp"), "result": self.result}
+        found |= {"report": self.report}
+        return found | ({"view": self.view} if view else {})
+
     def applied(self, name: str, given: Path | None) -> Path:
         """In its own format where that is written, otherwise in that of the moved source."""
         # What is no mesh may not fit into STL.
@@ -69,8 +76,7 @@ class Outputs:
             StorageError: a file is there already.
         """
         check_output(self.moved, SURFACE_SUFFIXES, overwrite=overwrite)
-        others = [self.beside("field.npz"), self.beside("field.vtp"), self.result, self.report]
-        others += [self.view] * view
+        _, *others = self.files(view=view).values()
         if self.moved in others:
             raise DataError(f"{self.moved} is the name of another output; choose another one.")
         for path in others:
@@ -135,7 +141,7 @@ def move_files(
     *,
     suffix: str = "",
     overwrite: bool = False,
-) -> Iterator[str]:
+) -> Iterator[tuple[Path, list[str]]]:
     """Move files as a registration moved its source, into a folder, under their own names.
 
     Everything is read and looked at before the first is written.
@@ -148,7 +154,7 @@ def move_files(
         overwrite: replace files that are there already.
 
     Yields:
-        A line on each, and what there is to say of it.
+        Where each went, and what there is to say of it.
 
     Raises:
         DataError: unreadable, in another space, or two would have one name.
@@ -167,9 +173,7 @@ def move_files(
         check_holds(path, surface)
     for path, surface in zip(paths, shapes, strict=True):
         left_out = write_moved(path, result.transform(surface), overwrite=overwrite)
-        yield str(path)
-        yield from (f"  {sentence}" for sentence in (*_far(result, surface), *lost(surface)))
-        yield from (f"  {sentence}" for sentence in cannot_hold(path, left_out))
+        yield path, [*_far(result, surface), *lost(surface), *cannot_hold(path, left_out)]
 
 
 def _far(result: RegistrationResult, surface: Surface) -> list[str]:

@@ -15,6 +15,7 @@ from dine.files import file_digest
 from dine.geometry.distance import landmark_errors
 from dine.geometry.surface import Surface
 from dine.models.devices import chosen_device
+from dine.progress import stage
 from dine.refinement.refine import ROUNDS
 from dine.registration.assessment import Measures, assess, expected_error, measure
 from dine.registration.correspondence import aligned_pairs, most_probable
@@ -111,6 +112,7 @@ def _with_prior(
     from dine.priors.organ import OrganPrior, load_organ_prior
     from dine.registration.organ import OrganSettings, register_organ
 
+    stage("reading, and the organ's field")
     return register_organ(
         as_surface(source, "source"),
         as_surface(target, "target"),
@@ -139,15 +141,16 @@ def _registered(
     landmarks: tuple[Points, Points] | None,
 ) -> RegistrationResult:
     began = time.perf_counter()
+    stage("reading")
     model = model or load_model()
     source, target = as_surface(source, "source"), as_surface(target, "target")
     further = {name: as_surface(shape, name) for name, shape in apply.items()}
     marks = None if landmarks is None else checked_landmarks(landmarks, source, target)
     check_spaces(source, (target, *further.values()))
     notes = check_sizes(source, target, settings.partial)
-    pairs = aligned_pairs(source, target, settings, model.convention)
-    pair, correspondence = most_probable(pairs, model, settings)
+    pair, correspondence = _corresponding(source, target, model, settings)
     notes += _support(correspondence)
+    stage("measures")
 
     motion = Motion(pair.alignment, correspondence.interpolated())
     moved = motion.surface(source)
@@ -184,6 +187,26 @@ def _registered(
         alignment=pair.alignment,
         motion=motion,
     )
+
+
+def _corresponding(
+    source: Surface, target: Surface, model: Model, settings: Settings
+) -> tuple[Pair, Correspondence]:
+    """The alignment and what it leads to, stage by stage."""
+    later = "points and surfaces" if settings.surfaces and settings.rounds else "points"
+    stage("alignment")
+    pairs = aligned_pairs(source, target, settings, model.convention)
+    if settings.partial:  # without the network, which each alignment begins with otherwise
+        stage(later)
+    hooks = [
+        model.backbone.register_forward_pre_hook(lambda *_: stage("network")),
+        model.backbone.register_forward_hook(lambda *_: stage(later)),
+    ]
+    try:
+        return most_probable(pairs, model, settings)
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 def _support(correspondence: Correspondence) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from dine.geometry.surface import Surface
 from dine.registration.calibration import Calibration
 from dine.registration.objects import is_object
 from dine.registration.shapes import Shape, as_surface, checked_points, dense_points
+
+if TYPE_CHECKING:
+    from dine.registration.grid import DisplacementGrid
 
 
 @dataclass(frozen=True)
@@ -251,6 +254,37 @@ class RegistrationResult:
         if isinstance(shape, Surface | str | Path | tuple) or is_object(shape):
             return self.motion.surface(as_surface(shape, "shape"))
         return self.motion(checked_points(shape))
+
+    def displacement_grid(
+        self,
+        spacing: float | None = None,
+        *,
+        margin: float | None = None,
+        inverse: bool = False,
+        space: str | None = None,
+    ) -> DisplacementGrid:
+        """What :meth:`transform` does, on a grid that 3D Slicer and ITK apply (LPS).
+
+        Args:
+            spacing: of the voxels, in the units of the source; by default a 64th of the longest
+                side.
+            margin: how far beyond the source's box the grid goes; by default a tenth of the box's
+                longest side.
+            inverse: from the target back to the source, around the moved source: what ITK resamples
+                an image of the source by.
+            space: ``lps`` or ``ras``, the coordinates of the scans; by default what the source's
+                file states, or LPS, as 3D Slicer takes it.
+
+        Returns:
+            The grid, whose ``write`` makes a file of it.
+
+        Raises:
+            ConfigError: a spacing or margin that is no length, more than 5 million voxels, or
+                another space than the source states.
+        """
+        from dine.registration.grid import displacement_grid
+
+        return displacement_grid(self, spacing, margin=margin, inverse=inverse, space=space)
 
     def save(
         self, folder: str | Path, *, suffix: str = ".ply", view: bool = False, overwrite=False

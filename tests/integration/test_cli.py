@@ -1,5 +1,7 @@
-"""What the help of every command says."""
+"""What the help of every command says, and in which form they speak."""
 
+import json
+import re
 import shlex
 import shutil
 from pathlib import Path
@@ -64,3 +66,62 @@ def test_scans_to_try_things_with(tmp_path):
     # They are not written over.
     again = CliRunner().invoke(cli.cli, ["scans", str(tmp_path / "trial")])
     assert "is there already" in str(again.exception)
+
+
+def test_commands_are_listed_in_groups():
+    """Every one once, those on one's own scans first."""
+    shown = CliRunner().invoke(cli.cli, ["--help"]).output
+    listed = re.findall(r"^  ([a-z][\w-]+)  ", shown, re.MULTILINE)
+    assert listed[0] == "register"
+    assert sorted(listed) == sorted(cli.cli.commands)
+    assert re.findall(r"^(\w.+):$", shown, re.MULTILINE) == ["Options", *cli.GROUPS]
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["inspect", "none"], 1, "Error: none is not a folder; expected"),
+        (["register", "a.ply"], 2, "Error: Missing argument 'TARGET'. See `dine register --help`."),
+        (["inspec"], 2, "Error: No such command 'inspec'. Did you mean 'inspect'? See `dine"),
+        (["--lof"], 2, "Error: No such option '--lof'"),
+        (
+            ["register", "a", "b", "-o", "c.ply", "--map", "-1"],
+            2,
+            "Error: Invalid value for '--map'",
+        ),
+        (["-q", "config", "check", "none.yaml"], 1, "Error: none.yaml"),
+    ],
+)
+def test_all_errors_are_one_line_of_one_form(words, code, said, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["dine", *words])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == code
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert error.startswith(said)
+    assert len(error.splitlines()) == 1
+
+
+def test_details_of_errors_for_who_asks(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr("sys.argv", ["dine", "inspect", str(tmp_path / "none"), "-v"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    lines = capsys.readouterr().err.splitlines()
+    assert "Traceback (most recent call last):" in lines
+    assert lines[-1].startswith("Error: ")
+
+
+def test_results_go_to_the_log_and_not_out_in_quiet(tmp_path):
+    config = str(CONFIG)
+    inspected = ["inspect", str(CONFIG.parent / "dine" / "scans")]
+    done = CliRunner().invoke(cli.cli, ["--log", str(tmp_path / "log"), *inspected])
+    assert "2 undeformed objects" in done.stdout
+    assert done.stderr == ""
+    assert "2 undeformed objects" in (tmp_path / "log").read_text()
+    assert CliRunner().invoke(cli.cli, [*inspected, "-q"]).output == ""
+    # The next one in the same process is as loud as ever.
+    told = json.loads(CliRunner().invoke(cli.cli, [*inspected, "--json"]).stdout)
+    assert (told["pairs"], told["undeformed"], told["left_out"]) == ([], 2, [])
+    assert CliRunner().invoke(cli.cli, ["config", "check", config]).stdout

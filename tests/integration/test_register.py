@@ -429,7 +429,7 @@ def test_weights_must_fit(tmp_path):
     other.write_bytes(b"nothing")
     with pytest.raises(CheckpointError):
         load_model(weights=other)
-    with pytest.raises(ConfigError, match="no pretrained weights"):
+    with pytest.raises(ConfigError, match="'unheard_of', only for deftransnet and robust_defreg"):
         load_model("unheard_of")
 
 
@@ -555,6 +555,30 @@ def test_command_writes_everything(files, tmp_path, pair):
     assert report["trust"]["expected_error"] > 0
 
 
+def test_command_tells_programs_and_the_log(files, tmp_path):
+    """One JSON object on stdout and nothing else; what is printed otherwise is in the log."""
+    out, log = tmp_path / "moved.ply", tmp_path / "log"
+    options = ("--points", 64, "--json", "-q", "--apply", files[0])
+    options += ("--grid", tmp_path / "moved.nrrd", "--grid-inverse", tmp_path / "moved.back.mha")
+    options += ("--grid-spacing", 0.4)
+    done = run("--log", log, "register", *files, "-o", out, *options)
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    report = json.loads(out.with_suffix(".json").read_text())
+    assert told["verdict"] == report["trust"]["verdict"]
+    assert told["reasons"] == report["trust"]["reasons"]
+    for name in ("before", "after", "displacement", "folding", "seconds"):
+        assert told[name] == report[name]
+    places = [place for place in told["files"].values() if isinstance(place, str)]
+    written = {Path(place) for place in (*places, *told["files"]["applied"].values())}
+    assert written == set(tmp_path.glob("moved.*"))
+    lines = log.read_text().splitlines()
+    stages = ["reading", "alignment", "network", "points and surfaces", "measures", "writing"]
+    said = [line.split(" ", 1)[1] for line in lines]
+    assert [name for name in dict.fromkeys(said) if name in stages] == stages
+    assert any(line.startswith(f"{out}: HD95 ") for line in said)
+
+
 def test_command_writes_further_shapes_as_they_can_be(files, tmp_path, pair):
     """Formats that are read but not written are written as the moved source is."""
     cloud = tmp_path / "marks.pts"
@@ -635,7 +659,7 @@ def test_command_keeps_what_exists(files, tmp_path):
     out.with_suffix(".json").write_text("precious")
     done = run("register", *files, "-o", out)
     assert isinstance(done.exception, DineError)
-    assert "exists already" in str(done.exception)
+    assert "exists already; choose another name, or replace it (--overwrite" in str(done.exception)
     assert out.with_suffix(".json").read_text() == "precious"
     assert not out.exists()
     assert run("register", *files, "-o", out, *QUICK, "--overwrite").exit_code == 0
@@ -671,7 +695,12 @@ def test_many_pairs_go_on_where_they_stopped(files, tmp_path):
     moved = out / "first" / "moved.ply"
     before = moved.stat().st_mtime_ns
     (tmp_path / "missing.ply").write_bytes(files[0].read_bytes())
-    assert run(*arguments).exit_code == 0
+    done = run("-q", *arguments, "--json")
+    assert done.exit_code == 0
+    told = json.loads(done.stdout)
+    assert (told["registered"], told["failed"]) == (2, 0)
+    assert told["pairs"][0]["verdict"] == summary.loc["first", "verdict"]
+    assert told["pairs"][0]["hd95_after"] == pytest.approx(summary.loc["first", "hd95_after"])
     assert moved.stat().st_mtime_ns == before
     assert (pd.read_csv(out / "summary.csv")["state"] == "done").all()
     write_surface(files[0], Surface(organ().vertices * 1.1, organ().faces))

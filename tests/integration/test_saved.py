@@ -1,7 +1,9 @@
 """Results that are kept: moved with later, written, read back and applied to further files."""
 
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -171,7 +173,11 @@ def test_apply_moves_files_later(result, tmp_path):
     done = run("apply", tmp_path / "run", *files, "-o", tmp_path / "out")
     assert isinstance(done.exception, StorageError)
     more = ("-o", tmp_path / "out", "--suffix", ".vtp", "--overwrite")
-    assert run("apply", tmp_path / "run" / "moved.json", *files, *more).exit_code == 0
+    done = run("apply", tmp_path / "run" / "moved.json", *files, *more, "--json")
+    told = json.loads(done.stdout)["files"]
+    assert [Path(one["source"]) for one in told] == list(files)
+    assert Path(told[1]["moved"]) == tmp_path / "out" / "marks.vtp"
+    assert "33 % of its points" in told[1]["notes"][0]
     assert len(read_surface(tmp_path / "out" / "marks.vtp").vertices) == 3
 
 
