@@ -232,6 +232,19 @@ def apply(result, files, out, suffix, overwrite):
         click.echo(line)
 
 
+def _population(template: Path | None, **options):
+    """What makes the shape model, or None where there is no template."""
+    if template is not None:
+        return {"template": template, "options": options}
+    chosen = [name for name, value in options.items() if value]
+    if chosen:
+        raise ConfigError(
+            f"--{chosen[0].replace('_', '-')} is about a shape model; name its template "
+            "(--template), or leave it out."
+        )
+    return None
+
+
 @click.command(
     "register-many",
     epilog="""
@@ -240,19 +253,39 @@ def apply(result, files, out, suffix, overwrite):
     \b
     dine register-many pairs.csv -o results/scans
     dine register-many scans/ -o results/scans --view
+    dine register-many --template liver.ply patients/*.ply -o livers
     """,
 )
-@click.argument("manifest", type=click.Path(exists=False, path_type=Path))
+@click.argument("inputs", nargs=-1, required=True, type=click.Path(exists=False, path_type=Path))
 @click.option("-o", "--out", type=OUT_FOLDER, required=True, help="Folder of all results.")
 @click.option("--suffix", default="", help="Format of the moved sources, such as .ply.")
+@gathered(
+    "population",
+    _population,
+    click.option(
+        "--template", type=IN, help="A mesh to register to all INPUTS, for a shape model of them."
+    ),
+    click.option("--scale", is_flag=True, help="Shape model without size: all scaled to one."),
+    click.option(
+        "--include-doubtful", is_flag=True, help="Doubtful registrations count in the shape model."
+    ),
+    click.option(
+        "--modes",
+        type=click.IntRange(1),
+        help="Of the shape model to keep; by default those of 95 % of the variance.",
+    ),
+)
 @registration_options
 @view_option
 @model_options
-def register_many(manifest, out, suffix, settings, view, load_model):
-    """Register every pair of MANIFEST, a CSV file (source, target, name) or a folder.
+def register_many(inputs, out, suffix, population, settings, view, load_model):
+    """Register every pair of INPUTS, a CSV file (source, target, name) or a folder.
 
     A pair that fails is reported and does not stop the others; run the same command again to go on
     after an interruption. OUT/summary.csv has one row a pair.
+
+    With --template, INPUTS are scans of a population. OUT gets their mean shape, modes, a prior to
+    register further scans with, scores and quality of this shape model.
     """
     from dine.registration.many import read_jobs
     from dine.registration.many import register_many as run
@@ -261,12 +294,46 @@ def register_many(manifest, out, suffix, settings, view, load_model):
     loaded = load_model()
     if "prior" in loaded:
         raise ConfigError(f"{loaded['prior']} is the prior of an organ; `dine register` takes it.")
-    jobs = read_jobs(manifest)
-    summary = run(jobs, out, loaded["model"], suffix=suffix, view=view, settings=settings)
-    failed = int((summary["state"] == "failed").sum())
-    click.echo(f"{len(summary) - failed} of {len(summary)} registered; {out / 'summary.csv'}")
+    common = {"suffix": suffix, "view": view, "settings": settings}
+    if population is not None:
+        failed = _shape_model(inputs, out, loaded["model"], population, common)
+    else:
+        if len(inputs) > 1:
+            raise ConfigError(
+                f"{len(inputs)} files were given; expected one list or folder of pairs, or "
+                "--template and scans."
+            )
+        summary = run(read_jobs(inputs[0]), out, loaded["model"], **common)
+        failed = int((summary["state"] == "failed").sum())
+        click.echo(f"{len(summary) - failed} of {len(summary)} registered; {out / 'summary.csv'}")
     if failed:
         sys.exit(1)
+
+
+def _shape_model(inputs, out, model, population, common) -> int:
+    """Make a shape model and say how good it is; how many scans could not be registered."""
+    from dine.registration.population import (
+        PopulationFiles,
+        PopulationOptions,
+        population_jobs,
+        population_model,
+    )
+
+    jobs = population_jobs(population["template"], inputs, out)
+    options = PopulationOptions(**population["options"])
+    found, quality = population_model(jobs, out, model, options, **common)
+    row = list(quality.rows())[found.kept]
+    click.echo(
+        f"{PopulationFiles(out).prior}: {found.kept} modes of {len(found.shapes)} of {len(jobs)} "
+        f"scans, {100 * row['compactness']:.0f} % of the variance, generalisation "
+        f"{row['generalisation']:.3g} ({row['generalisation_percent']:.1f} % of the radius), "
+        f"specificity {row['specificity']:.3g} ({row['specificity_percent']:.1f} %)"
+    )
+    for member in found.members:
+        if not member.used:
+            facts = member.facts
+            click.echo(f"  {member.name} is left out, {facts['verdict']}: {facts['message']}")
+    return sum(member.vertices is None for member in found.members)
 
 
 @click.command()
