@@ -122,6 +122,22 @@ def test_it_goes_on_where_it_stopped(made, folder):
     assert not (out / "modes" / "mode2_plus2sd.ply").exists()
 
 
+def test_a_scan_of_other_units_is_named_and_left_out(made, folder, tmp_path):
+    write_surface(tmp_path / "metres.ply", Surface(organ(0.1).vertices / 1000, organ().faces))
+    files = [*sorted((folder / "patients").glob("*.ply")), tmp_path / "metres.ply"]
+    template = ("--template", folder / "template.ply")
+    done = run("register-many", *template, *files, "-o", made[0], *QUICK)
+    assert done.exit_code == 1
+    assert "metres is left out, failed:" in done.output
+    assert "metres and the other in millimetres" in done.output.replace("\n", " ")
+    row = read_rows(made[0] / "scores.csv")[-1]
+    assert (row["name"], row["used"], row["verdict"]) == ("metres", "False", "failed")
+    assert row["mahalanobis"] == row["mode1"] == ""
+    report = read_json(made[0] / "model.json")
+    assert report["scans"]["used"] == ["a", "b", "c", "d"]
+    assert list(report["scans"]["left_out"]) == ["metres"]
+
+
 @pytest.mark.parametrize(
     ("words", "error", "said"),
     [
