@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from dine.geometry.surface import Surface
     from dine.io.readers import read_surface
     from dine.io.writers import write_moved
+    from dine.priors.shape_model import ShapeModel
     from dine.registration.model import load_model
+    from dine.registration.population import shape_model
     from dine.registration.register import register
     from dine.registration.saved import load_result
     from dine.registration.types import Model, RegistrationResult, Trust
@@ -37,7 +39,9 @@ _HOMES = {
     "geometry.surface": ("Surface",),
     "io.readers": ("read_surface",),
     "io.writers": ("write_moved",),
+    "priors.shape_model": ("ShapeModel",),
     "registration.model": ("load_model",),
+    "registration.population": ("shape_model",),
     "registration.register": ("register",),
     "registration.saved": ("load_result",),
     "registration.types": ("Model", "RegistrationResult", "Trust"),
@@ -51,6 +55,7 @@ __all__ = [
     "DownloadError",
     "Model",
     "RegistrationResult",
+    "ShapeModel",
     "StorageError",
     "Surface",
     "Trust",
@@ -59,6 +64,7 @@ __all__ = [
     "load_result",
     "read_surface",
     "register",
+    "shape_model",
     "write_moved",
 ]
 

@@ -320,6 +320,19 @@ def apply(result, files, out, suffix, overwrite, as_json, grids):
     tell(lines, {"files": facts, **grids.files, "notes": notes}, as_json)
 
 
+def _population(template: Path | None, **options):
+    """What makes the shape model, or None where there is no template."""
+    if template is not None:
+        return {"template": template, "options": options}
+    chosen = [name for name, value in options.items() if value]
+    if chosen:
+        raise ConfigError(
+            f"--{chosen[0].replace('_', '-')} is about a shape model; name its template "
+            "(--template), or leave it out."
+        )
+    return None
+
+
 @click.command(
     "register-many",
     epilog="""
@@ -328,19 +341,39 @@ def apply(result, files, out, suffix, overwrite, as_json, grids):
     \b
     dine register-many pairs.csv -o results/scans
     dine register-many scans/ -o results/scans --view
+    dine register-many --template liver.ply patients/*.ply -o livers
     """,
 )
-@click.argument("manifest", type=click.Path(exists=False, path_type=Path))
+@click.argument("inputs", nargs=-1, required=True, type=click.Path(exists=False, path_type=Path))
 @own_out_option("Folder of all results.", OUT_FOLDER)
 @click.option("--suffix", default="", help="Format of the moved sources, such as .ply.")
+@gathered(
+    "population",
+    _population,
+    click.option(
+        "--template", type=IN, help="A mesh to register to all INPUTS, for a shape model of them."
+    ),
+    click.option("--scale", is_flag=True, help="Shape model without size: all scaled to one."),
+    click.option(
+        "--include-doubtful", is_flag=True, help="Doubtful registrations count in the shape model."
+    ),
+    click.option(
+        "--modes",
+        type=click.IntRange(1),
+        help="Of the shape model to keep; by default those of 95 % of the variance.",
+    ),
+)
 @registration_options
 @gathered("shown", dict, view_option, json_option)
 @model_options
-def register_many(manifest, out, suffix, settings, shown, load_model):
-    """Register every pair of MANIFEST, a CSV file (source, target, name) or a folder.
+def register_many(inputs, out, suffix, population, settings, shown, load_model):
+    """Register every pair of INPUTS, a CSV file (source, target, name) or a folder.
 
     A pair that fails is reported and does not stop the others; run the same command again to go on
     after an interruption. OUT/summary.csv has one row a pair.
+
+    With --template, INPUTS are scans of a population. OUT gets their mean shape, modes, a prior to
+    register further scans with, scores and quality of this shape model.
     """
     from dine.registration.many import read_jobs
     from dine.registration.many import register_many as run
@@ -349,17 +382,53 @@ def register_many(manifest, out, suffix, settings, shown, load_model):
     loaded = load_model()
     if "prior" in loaded:
         raise ConfigError(f"{loaded['prior']} is the prior of an organ; `dine register` takes it.")
-    jobs = read_jobs(manifest)
-    view = shown["view"]
-    summary = run(jobs, out, loaded["model"], suffix=suffix, view=view, settings=settings)
-    failed, table = int((summary["state"] == "failed").sum()), out / "summary.csv"
-    done = len(summary) - failed
-    # Through text, in which what is missing has no number.
-    pairs = json.loads(summary.to_json(orient="records", double_precision=15))
-    facts = {"registered": done, "failed": failed, "summary": table, "pairs": pairs}
-    tell([f"{done} of {len(summary)} registered; {table}"], facts, shown["as_json"])
+    common = {"suffix": suffix, "view": shown["view"], "settings": settings}
+    if population is not None:
+        failed, lines, facts = _shape_model(inputs, out, loaded["model"], population, common)
+    else:
+        if len(inputs) > 1:
+            raise ConfigError(
+                f"{len(inputs)} files were given; expected one list or folder of pairs, or "
+                "--template and scans."
+            )
+        summary = run(read_jobs(inputs[0]), out, loaded["model"], **common)
+        failed, table = int((summary["state"] == "failed").sum()), out / "summary.csv"
+        done = len(summary) - failed
+        # Through text, in which what is missing has no number.
+        pairs = json.loads(summary.to_json(orient="records", double_precision=15))
+        facts = {"registered": done, "failed": failed, "summary": table, "pairs": pairs}
+        lines = [f"{done} of {len(summary)} registered; {table}"]
+    tell(lines, facts, shown["as_json"])
     if failed:
         sys.exit(1)
+
+
+def _shape_model(inputs, out, model, population, common) -> tuple[int, list[str], dict]:
+    """Make a shape model: how many scans could not be registered, and what to say of it."""
+    from dine.registration.population import (
+        PopulationFiles,
+        PopulationOptions,
+        population_jobs,
+        population_model,
+    )
+
+    jobs = population_jobs(population["template"], inputs, out)
+    options = PopulationOptions(**population["options"])
+    found, quality = population_model(jobs, out, model, options, **common)
+    row, prior = list(quality.rows())[found.kept], PopulationFiles(out).prior
+    lines = [
+        f"{prior}: {found.kept} modes of {len(found.shapes)} of {len(jobs)} "
+        f"scans, {100 * row['compactness']:.0f} % of the variance, generalisation "
+        f"{row['generalisation']:.3g} ({row['generalisation_percent']:.1f} % of the radius), "
+        f"specificity {row['specificity']:.3g} ({row['specificity_percent']:.1f} %)"
+    ]
+    left_out = {member.name: member.facts for member in found.members if not member.used}
+    lines += [
+        f"  {name} is left out, {facts['verdict']}: {facts['message']}"
+        for name, facts in left_out.items()
+    ]
+    facts = {"prior": prior, "modes": found.kept, "quality": row, "left_out": left_out}
+    return sum(member.vertices is None for member in found.members), lines, facts
 
 
 @click.command()
