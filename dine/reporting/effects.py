@@ -1,11 +1,12 @@
-"""What a run says in short: each prior against the control, with intervals, and nothing more.
+"""What a run says in short: verdicts on each prior against the control, with intervals.
 
-A sentence is only as strong as its interval, which holds the chance of the test pairs and that of
-the training (:func:`dine.evaluation.statistics.verdicts`); where it holds zero, the sentence says
-undecided.
+A verdict is only as strong as its interval, which holds the chance of the test pairs and that of
+the training (:func:`dine.evaluation.statistics.verdicts`); where that holds zero, it is undecided.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
@@ -13,12 +14,9 @@ import pandas as pd
 from dine.config import CONTROL, STAGE1
 from dine.evaluation.statistics import verdicts
 from dine.reporting import names
-from dine.reporting.loading import origin_of
 from dine.reporting.names import DASH, change, display_name, in_order
-from dine.reporting.table import Cell, Table
+from dine.reporting.table import Cell, Columns, Table, laid_out
 from dine.results import CLEAN, trained_on
-
-_KEYS = ["objects", "dataset", "backbone", "method"]
 
 
 def effects(
@@ -38,80 +36,86 @@ def effects(
     return in_order(found, ["objects", "method", "dataset", "backbone"])
 
 
-def headlines(control: pd.DataFrame, metrics: pd.DataFrame) -> list[str]:
-    """A sentence for each kind of objects and each prior, on clean targets.
+def findings(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[Table]:
+    """Verdicts on clean targets, then those under other conditions and by other measures.
 
-    ``control`` is the table of ``effects`` against the control.
+    Empty where no prior was evaluated beside the control.
     """
-    table = control[control["condition"] == CLEAN]
-    groups = table.groupby(["objects", "method"], sort=False)
-    found = [_headline(method, kind, rows, metrics) for (kind, method), rows in groups]
-    return found or ["No prior was evaluated in this run, so there is nothing to compare."]
-
-
-def _headline(method: str, objects: str, rows: pd.DataFrame, metrics: pd.DataFrame) -> str:
-    name = display_name(method)
-    words = {
-        "lower": f"{name} has a lower mean Chamfer distance than the control on",
-        "higher": f"{name} has a higher mean Chamfer distance than the control on",
-        "undecided": f"whether {name} differs from the control is undecided on",
-    }
-    parts = []
-    for verdict, text in words.items():
-        places = [
-            f"{display_name(trained_on(row['dataset']))} with {display_name(row['backbone'])} "
-            f"{change(row['relative'], row['low'], row['high'])}"
-            for row in rows[rows["verdict"] == verdict].to_dict("records")
-        ]
-        if places:
-            parts.append(f"{text} {', '.join(places)}")
-    made = {names.ORIGINS[origin_of(name, metrics)] for name in rows["dataset"]}
-    kind = f"{names.OBJECTS[objects].capitalize()} ({', '.join(sorted(made))})"
-    return f"{kind}: {'; '.join(parts)}."
-
-
-def overview(control: pd.DataFrame, metrics: pd.DataFrame, *, spread: float = 0.0) -> Table | None:
-    """Each prior's differences under every condition, with what follows; None without priors.
-
-    ``control`` is the table of ``effects`` against the control.
-    """
-    if control.empty:
-        return None
+    control = effects(metrics, spread=spread)
     errors = effects(metrics, value="mce", spread=spread)
     first = effects(metrics, STAGE1, spread=spread)
-    columns = {
-        f"CD, {text.lower()}": control[control["condition"] == name]
-        for name, text in names.CONDITIONS.items()
-        if (control["condition"] == name).any()
-    }
-    columns["MCE, deformation"] = errors[errors["condition"] == CLEAN]
-    columns["CD, deformation, against Stage 1"] = first[first["condition"] == CLEAN]
-    found = [table.set_index(_KEYS).to_dict("index") for table in columns.values()]
-    rows = []
-    for place in control[_KEYS].drop_duplicates().itertuples(index=False, name=None):
-        head = [names.OBJECTS[place[0]].capitalize(), display_name(trained_on(place[1]))]
-        cells = [verdict_cell(table.get(place)) for table in found]
-        rows.append((*map(Cell, [*head, *map(display_name, place[2:])]), *cells))
-    header = ("Objects", "Dataset", "Backbone", "Prior", *columns)
-    caption = _CAPTION.format(chance=training_chance(spread) if spread else "")
-    return Table("", "", caption, tuple(("", name) for name in header), tuple(rows), control)
+    clean = control[control["condition"] == CLEAN]
+    others = [
+        control[control["condition"] != CLEAN].assign(measure=lambda x: x["condition"]),
+        errors[errors["condition"] == CLEAN].assign(measure="mce"),
+        first[first["condition"] == CLEAN].assign(measure=STAGE1),
+    ]
+    caption = _CAPTION + (training_chance(spread) if spread else "")
+    made = [
+        ("Does a prior lower the Chamfer distance on clean targets?", caption, clean),
+        (
+            "Under other conditions, and by other measures",
+            "",
+            in_order(pd.concat(others), ["measure", "objects", "method"]),
+        ),
+    ]
+    return [
+        Table("", title, text, **laid_out(_by_place(data)), data=data)
+        for title, text, data in made
+        if len(data)
+    ]
 
 
-def verdict_cell(row: dict | None, name: str = "verdict") -> Cell:
-    """A verdict with the difference in percent of the reference and its interval."""
-    if row is None:
-        return Cell(DASH)
-    text = f"{row[name]}: {change(row['relative'], row['low'], row['high'])}"
-    return Cell(text, row[name] == "lower")
+_MEASURES = {
+    **{key: f"Chamfer distance, {text.lower()}" for key, text in names.CONDITIONS.items()},
+    "mce": "Mean correspondence error",
+    STAGE1: "Chamfer distance, against Stage 1",
+}
+
+
+def _by_place(data: pd.DataFrame) -> Columns:
+    """A row for each kind of objects and prior, or ``measure`` of these; a column for each place.
+
+    A place is a dataset with a backbone, whether the objects are known or not.
+    """
+    data = data.assign(dataset=data["dataset"].map(trained_on))
+    keys = ["measure", "objects", "method"] if "measure" in data else ["objects", "method"]
+    rows = list(data[keys].drop_duplicates().itertuples(index=False, name=None))
+    columns: Columns = {}
+    if len(keys) > 2:
+        columns["", "Measure"] = [_MEASURES[row[0]] for row in rows]
+    columns["", "Objects"] = [names.OBJECTS[row[-2]].capitalize() for row in rows]
+    columns["", "Prior"] = [display_name(row[-1]) for row in rows]
+    for place, here in in_order(data, ["dataset", "backbone"]).groupby(
+        ["dataset", "backbone"], sort=False
+    ):
+        found = here.set_index(keys).to_dict("index")
+        columns[tuple(map(display_name, place))] = verdict_cells(found.get(row) for row in rows)
+    return columns
+
+
+def verdict_cells(rows: Iterable[dict | None], name: str = "verdict") -> list[Cell]:
+    """Verdicts with the difference in percent of the reference and its interval."""
+    return [
+        Cell(DASH)
+        if row is None
+        else Cell(
+            f"{row[name]}: {change(row['relative'], row['low'], row['high'])}",
+            row[name] == "lower",
+            row[name],
+        )
+        for row in rows
+    ]
 
 
 _CAPTION = (
-    "Differences of the means in percent of the control's (or Stage 1's), over all levels and "
-    "strengths; negative: the prior is lower. In brackets the 95 % interval, of the test pairs "
-    "that both methods share: drawn by deformation where the object is known, and by object where "
-    "it is unseen.{chance} Lower or higher: the interval holds no zero. Otherwise the matter is "
-    "undecided. Known objects are those that were trained on, under deformations that were not; "
-    "the prior is defined for these. Unseen objects were not trained on at all."
+    "Lower, higher or undecided: the mean of the prior against that of the control, which was "
+    "trained alike but with λ = 0. Beside it the difference in percent of the control's mean, over "
+    "all levels and strengths, and its 95 % interval. Where that holds zero, the matter is "
+    "undecided. The interval is of the test pairs that both methods share: drawn by deformation "
+    "where the object is known, and by object where it is unseen. "
+    "Known objects are those that were trained on, under deformations that were not; the prior is "
+    "defined for these. Unseen objects were not trained on at all."
 )
 
 

@@ -7,6 +7,7 @@ global state. Every figure says where its data come from.
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,10 +80,22 @@ def save_figure(figure: Figure, path_stem: str | os.PathLike) -> list[Path]:
 def new_figure(width: float, height: float, title: str, origin: str, note: str = "") -> Figure:
     """An empty figure, inches; its title says where the data come from."""
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure.suptitle(f"{plain(title)} ({names.ORIGINS[origin]})", fontsize=12)
+    title = f"{plain(title)} ({names.ORIGINS[origin]})"
+    figure.suptitle(textwrap.fill(title, int(11.5 * width)), fontsize=11)
     if note:
-        figure.supxlabel(note, fontsize=8, color="#444444")
+        figure.supxlabel(textwrap.fill(note, int(17 * width)), fontsize=8, color="#444444")
     return figure
+
+
+def legend_below(figure: Figure, panels: Iterable[Any], columns: int, note: str = "") -> None:
+    """One legend for all panels, of the fullest one, with a note above."""
+    fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
+    handles, labels = fullest.get_legend_handles_labels()
+    title = textwrap.fill(note, int(17 * figure.get_figwidth()))
+    figure.legend(
+        handles, labels, title=title, title_fontsize=8, loc="outside lower center", ncols=columns,
+        **_SMALL,
+    )  # fmt: skip
 
 
 def plain_axes(axes: Any) -> Any:
@@ -124,18 +137,23 @@ def distance_figure(dataset: str, metrics: pd.DataFrame, condition: str = CLEAN)
         "noise": ("noise", "Noise σ"),
     }[condition]
     title = f"{display_name(dataset)}: {title}"
-    width = 5.2 * len(backbones) + 0.4
-    figure = new_figure(width, 4.3, title, str(rows["origin"].iloc[0]), note)
-    panels = figure.subplots(1, len(backbones), sharey=True, squeeze=False)[0]
+    # Beside a table of up to two backbones; that of more is too wide for anything beside it.
+    down, across = (len(backbones), 1) if len(backbones) < 3 else (1, len(backbones))
+    size = (5.2 if across == 1 else 4.2 * across, 2.9 * down + 1.8)
+    figure = new_figure(*size, title, str(rows["origin"].iloc[0]))
+    panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
     for axes, backbone in zip(panels, backbones, strict=True):
         for method, style in styles.items():
             here = [x[(x["backbone"] == backbone) & (x["method"] == method)] for x in (ours, paper)]
             _distance_lines(axes, *(x.sort_values(key) for x in here), key, style)
         axes.set_title(display_name(backbone), fontsize=11)
-        axes.set_xlabel(label)
-        axes.set_ylim(bottom=0)
-        plain_axes(axes).legend(**_SMALL)
-    panels[0].set_ylabel(f"Chamfer distance {_UNIT}")
+        plain_axes(axes)
+        if axes.get_subplotspec().is_last_row():
+            axes.set_xlabel(label)
+        if axes.get_subplotspec().is_first_col():
+            axes.set_ylabel(f"Chamfer distance {_UNIT}")
+    panels[0].set_ylim(bottom=0)
+    legend_below(figure, panels, 2 if across == 1 else 4, note)
     return figure
 
 
@@ -513,8 +531,8 @@ def pca_spectrum_figure(
     """Explained variance per component (log) and its cumulative share."""
     component = np.arange(1, len(explained_variance) + 1)
     cumulative = 100 * np.cumsum(explained_variance_ratio)
-    figure = new_figure(9.6, 3.8, title, origin)
-    left, right = figure.subplots(1, 2)
+    figure = new_figure(4.6, 5.6, title, origin)
+    left, right = figure.subplots(2, 1)
     colour = _STYLES["pca"][0]
     left.semilogy(component, explained_variance, color=colour, marker=".")
     left.set_ylabel("Explained variance")

@@ -278,7 +278,7 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
         DASH if np.isnan(row["low"]) else f"{names.interval(row['low'], row['high'])} %"
         for row in rows
     ]
-    columns["", "Verdict"] = data["verdict"].fillna(DASH)
+    columns["", "Verdict"] = [Cell(x or DASH, verdict=x) for x in data["verdict"].fillna("")]
     better = data["pairs_better_than_lambda0"]
     columns["", "Pairs better than control"] = [
         DASH if np.isnan(value) else f"{value:.0f} %" for value in better

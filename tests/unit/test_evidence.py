@@ -551,7 +551,7 @@ def test_report_is_one_self_contained_page(report):
     assert len(page.images) == 2 + 1 + 1 + 1 + 1 + 1
     for image in page.images:
         assert "SynBench (synthetic data)" in image["alt"]
-    for title in ("short", "main", "answer", "corrupted", "plausibility", "seeds", "priors"):
+    for title in ("findings", "main", "answer", "corrupted", "plausibility", "seeds", "priors"):
         assert title in page.ids
     # A figure stands beside the table of its numbers.
     for name in ("effects", "levels"):
@@ -607,7 +607,7 @@ def test_parts_without_data_are_left_out(tmp_path):
     assert {"main", "answer", "methods"} <= page.ids
     assert "synthetic" not in page.words
     assert "Configuration" not in page.words
-    assert "how much another training would differ" in page.words
+    assert "How much another training would differ" in page.words
 
 
 def test_files_of_unknown_datasets_are_refused(tmp_path):

@@ -11,7 +11,7 @@ import pandas as pd
 from dine.data.pairs import RESAMPLED
 from dine.evaluation.statistics import NO_BACKBONE
 from dine.reporting import names
-from dine.reporting.effects import verdict_cell
+from dine.reporting.effects import verdict_cells
 from dine.reporting.evidence.comparisons import LARGE, EvidenceStatistics, at
 from dine.reporting.names import (
     DASH,
@@ -116,8 +116,8 @@ def verdict_table(evidence: EvidenceStatistics, place: Place) -> Table:
     for value, (long, _, _, _) in VALUES.items():
         for condition in dict.fromkeys(data["condition"]):
             label = "Clean targets" if condition == CLEAN else names.CONDITIONS[condition]
-            rows = [found.get((value, condition, name)) for name in methods]
-            columns[long, label] = [verdict_cell(row, "decided") for row in rows]
+            rows = (found.get((value, condition, name)) for name in methods)
+            columns[long, label] = verdict_cells(rows, "decided")
         tallies = [levels.get((value, name), []) for name in methods]
         columns[long, f"Levels {LOWER} / {HIGHER}"] = [
             f"{x.count('lower')} / {x.count('higher')} of {len(x)}" for x in tallies
