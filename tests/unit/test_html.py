@@ -11,7 +11,8 @@ from PIL import Image, ImageChops, ImageStat
 
 from dine.errors import DataError
 from dine.reporting import figures, html, report, table
-from dine.reporting.effects import effects, findings
+from dine.reporting.comparisons import effects
+from dine.reporting.tables import findings
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 

@@ -13,10 +13,8 @@ from dine.config import CONTROL, Evaluation
 from dine.errors import DataError
 from dine.files import read_json
 from dine.provenance import versions
-from dine.reporting.effects import training_chance
-from dine.reporting.evidence.comparisons import LARGE, EvidenceStatistics, load_evidence
-from dine.reporting.evidence.figures import forest_figure, level_figure, plausibility_figure
-from dine.reporting.evidence.tables import (
+from dine.reporting.comparisons import LARGE, EvidenceStatistics, training_chance
+from dine.reporting.evidence_tables import (
     HIGHER,
     LOWER,
     answer_table,
@@ -26,8 +24,15 @@ from dine.reporting.evidence.tables import (
     mean_table,
     seed_table,
     verdict_table,
+    written,
 )
-from dine.reporting.figures import save_figure, search_figure
+from dine.reporting.figures import (
+    forest_figure,
+    level_figure,
+    plausibility_figure,
+    save_figure,
+    search_figure,
+)
 from dine.reporting.html import (
     Item,
     PageSection,
@@ -40,6 +45,7 @@ from dine.reporting.html import (
     picture,
     write_page,
 )
+from dine.reporting.loading import load_metrics
 from dine.reporting.names import PARTIAL, VALUES, display_name, slug
 from dine.reporting.table import Table, write_numbers, write_tables
 
@@ -142,14 +148,14 @@ def build_evidence(
             set aside, and its ``evaluation`` says how much differences vary with the training.
 
     Raises:
-        DataError: a file cannot be used, see ``load_evidence``, or is of a dataset that the
+        DataError: a file cannot be used, see ``load_metrics``, or is of a dataset that the
             metrics do not have; or methods were evaluated on pairs that do not meet.
     """
     config = config or {}
     settings = config.get("evidence") or {}
     aside = [*(settings.get("backbones") or {}), *(settings.get("test_sets") or {})]
     spread = (config.get("evaluation") or {}).get("training_spread", Evaluation().training_spread)
-    evidence = EvidenceStatistics(load_evidence(files.metrics), methods, reference, aside, spread)
+    evidence = EvidenceStatistics(load_metrics(files.metrics), methods, reference, aside, spread)
     page = _Page(evidence, out / "figures")
     sections = [
         *page.results(),
@@ -160,7 +166,7 @@ def build_evidence(
         PageSection("methods", "Methods", _methods(evidence, config)),
     ]
     write_tables(_tables([item for section in sections for item in section.items]), out / "tables")
-    write_numbers(evidence.comparisons, out / "tables" / "comparisons.csv")
+    write_numbers(written(evidence.comparisons), out / "tables" / "comparisons.csv")
     intro = [INTRO.format(reference=evidence.title(reference))]
     made = banners(evidence.metrics, published=False)
     write_page(out / "report.html", "Does a deformation prior help?", intro, made, sections)
