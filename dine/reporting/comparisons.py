@@ -23,7 +23,7 @@ from dine.reporting import names
 from dine.reporting.loading import origin_of
 from dine.reporting.names import DASH, change, display_name, in_order, rank
 from dine.reporting.table import Cell
-from dine.results import CLEAN
+from dine.results import CLEAN, trained_on
 
 Place = tuple[str, str]
 GROUPS = {
@@ -155,7 +155,9 @@ class EvidenceStatistics:
         self.places = self._places()
         # Few methods are tried with such backbones, so they would decide which can win at all; and
         # such datasets are too small to.
-        self.judged = [p for p in self.places if not set(p) & set(aside)] or self.places
+        self.judged = [
+            place for place in self.places if not {trained_on(place[0]), place[1]} & set(aside)
+        ] or self.places
         if self.comparisons.empty:
             raise DataError(f"The metrics hold no method to compare with {reference!r}.")
 

@@ -11,7 +11,14 @@ import pandas as pd
 from dine.data.pairs import RESAMPLED
 from dine.evaluation.statistics import NO_BACKBONE
 from dine.reporting import names
-from dine.reporting.comparisons import LARGE, EvidenceStatistics, Place, at, verdict_cells
+from dine.reporting.comparisons import (
+    LARGE,
+    EvidenceStatistics,
+    Place,
+    at,
+    training_chance,
+    verdict_cells,
+)
 from dine.reporting.names import (
     DASH,
     MARKS,
@@ -108,6 +115,26 @@ def basis_table(evidence: EvidenceStatistics) -> Table:
         )
     title = "What this rests on"
     return Table("basis", title, caption, **laid_out(columns), data=data.reset_index())
+
+
+def overview_table(evidence: EvidenceStatistics) -> Table:
+    """Lower, higher or undecided on clean targets: every method, at every place, by both values."""
+    columns = _methods(evidence, evidence.rivals)
+    for value, (long, _, _, _) in VALUES.items():
+        for place in evidence.places:
+            rows = evidence.overall(place)
+            found = rows[rows["value"] == value].set_index("method").to_dict("index")
+            cells = verdict_cells(found.get(name) for name in evidence.rivals)
+            columns[long, _short_place(place)] = cells
+    reference = evidence.title(evidence.reference)
+    caption = (
+        f"{_all_data(evidence)}, clean targets. Difference of the mean over all levels to "
+        f"{reference}, in percent of it, with its 95 % interval, of the pairs drawn by object. "
+        "Lower or higher: the interval holds no zero. Otherwise the matter is undecided."
+    )
+    caption += training_chance(evidence.spread) if evidence.spread else ""
+    title = f"Lower or higher than {reference}?"
+    return Table("", title, caption, **laid_out(columns), data=evidence.comparisons)
 
 
 def verdict_table(evidence: EvidenceStatistics, place: Place) -> Table:

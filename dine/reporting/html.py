@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -140,8 +141,13 @@ def _shown(items: Sequence[Item]) -> list[dict[str, Any]]:
         if not isinstance(item, Part):
             if item is not None and item != []:
                 found.append({"kind": type(item).__name__.lower(), "content": item})
-        elif item.kind in ("beside", "folded"):
-            found.append({"kind": item.kind, "title": item.title, "parts": _shown(item.content)})
+        elif item.kind == "folded":
+            found.append({"kind": "folded", "title": item.title, "parts": _shown(item.content)})
+        elif item.kind == "beside":
+            # Tables one above the other, and pictures.
+            runs = itertools.groupby(_shown(item.content), lambda x: x["kind"] == "picture")
+            parts = [(drawn, list(some)) for drawn, some in runs]
+            found.append({"kind": "beside", "parts": parts})
         elif item.kind == "picture":
             found.append({"kind": "picture", "caption": item.title, **_embedded(item.content)})
         else:

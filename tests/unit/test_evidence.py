@@ -252,6 +252,24 @@ def test_verdicts_where_the_goal_is_reached(evidence):
     assert cells["CPD"]["Below the best classical MCE"].text == "–"
 
 
+def test_findings_have_every_method_at_every_place(evidence):
+    table = tables.overview_table(evidence)
+    rows = shown(table)
+    assert list(rows) == [evidence.title(name) for name in evidence.rivals]
+    places = [
+        f"{d}, {b}"
+        for d in ("DeformedTissue", "SynBench")
+        for b in ("Robust-DefReg", "DefTransNet")
+    ]
+    values = ("Mean correspondence error", "Chamfer distance ×10⁻⁴")
+    assert table.header[2:] == tuple((value, place) for value in values for place in places)
+    for place, name in zip(evidence.places, places, strict=True):
+        whole = shown(tables.verdict_table(evidence, place))
+        for method, row in rows.items():
+            for value in values:
+                assert row[f"{value} {name}"] == whole[method][f"{value} Clean targets"]
+
+
 def test_what_the_numbers_rest_on(evidence):
     rows = [[cell.text for cell in row] for row in tables.basis_table(evidence).rows]
     assert rows == [
@@ -554,7 +572,7 @@ def test_report_is_one_self_contained_page(report):
         assert (
             report / "figures" / f"{name}_synbench{'_deftransnet' * (name == 'effects')}.png"
         ).exists()
-    beside = [part.partition("</figure>")[0] for part in text.split('class="beside"')[1:]]
+    beside = [part.partition("</table>")[0] for part in text.split('class="beside"')[1:]]
     assert len(beside) == 3
     assert all("<table" in part and "<img" in part for part in beside)
     for part in (
