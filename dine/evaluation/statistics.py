@@ -548,11 +548,13 @@ def _seed_spread(rows: pd.DataFrame, value: str) -> dict[tuple, dict[str, float]
     return found
 
 
-def summary(metrics: pd.DataFrame, *, pool_levels: bool = False) -> pd.DataFrame:
+def summary(
+    metrics: pd.DataFrame, values: Sequence[str] = SUMMARISED, *, pool_levels: bool = False
+) -> pd.DataFrame:
     """Mean and spread of every method by dataset, backbone, condition, corruption and level.
 
-    Values are averaged over seeds per pair first. ``pairs`` and ``seeds`` count; for each metric in
-    ``SUMMARISED``, ``<metric>_mean`` and ``<metric>_sd`` are mean and standard deviation (ddof = 1)
+    Values are averaged over seeds per pair first. ``pairs`` and ``seeds`` count; for each metric of
+    ``values``, ``<metric>_mean`` and ``<metric>_sd`` are mean and standard deviation (ddof = 1)
     over pairs, and ``<metric>_seed_sd`` the standard deviation over seeds of their means over pairs
     (NaN with one seed). ``mce_pairs_median`` and ``mce_pairs_p95`` are over pairs;
     ``failure_rate`` is the share of the pairs with an ``mce`` above 0.1, and its
@@ -560,27 +562,29 @@ def summary(metrics: pd.DataFrame, *, pool_levels: bool = False) -> pd.DataFrame
 
     Args:
         metrics: rows of ``metrics.csv``.
+        values: metrics to summarise.
         pool_levels: all deformation levels together; ``level`` is then NaN.
 
     Raises:
         DataError: a column is missing, a pair was evaluated twice, or seeds of one method were
             evaluated on different pairs.
     """
-    rows = _tidy(metrics, SUMMARISED)
+    measured = list(dict.fromkeys([*values, "mce"]))
+    rows = _tidy(metrics, measured)
     keys = ["dataset", "backbone", "method", "condition", "corruption", "level"]
-    values = [*SUMMARISED, "failure_rate"]
+    found = [*measured, "failure_rate"]
 
     def with_failures(frame: pd.DataFrame) -> pd.DataFrame:
         failed = (frame["mce"] > FAILURE).astype(float).where(frame["mce"].notna())
         frame = frame.assign(failure_rate=failed)
         return frame.assign(level=np.nan) if pool_levels else frame
 
-    over_pairs = with_failures(_over_seeds(rows, *SUMMARISED)).groupby(keys, dropna=False)
-    by_seed = with_failures(rows).groupby([*keys, "seed"], dropna=False)[values].mean()
-    mean, sd = over_pairs[values].mean(), over_pairs[values].std(ddof=1)
+    over_pairs = with_failures(_over_seeds(rows, *measured)).groupby(keys, dropna=False)
+    by_seed = with_failures(rows).groupby([*keys, "seed"], dropna=False)[found].mean()
+    mean, sd = over_pairs[found].mean(), over_pairs[found].std(ddof=1)
     seed_sd = by_seed.groupby(level=keys, dropna=False).std(ddof=1)
     columns = {"pairs": over_pairs.size(), "seeds": over_pairs["seeds"].max()}
-    for name in SUMMARISED:
+    for name in values:
         columns |= {f"{name}_mean": mean[name], f"{name}_sd": sd[name]}
         columns[f"{name}_seed_sd"] = seed_sd[name]
         if name == "mce":

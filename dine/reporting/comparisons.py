@@ -62,18 +62,25 @@ def effects(
     return in_order(found, ["objects", "method", "dataset", "backbone"])
 
 
-def verdict_cells(rows: Iterable[dict | None]) -> list[Cell]:
-    """Verdicts with the difference in percent of the reference and its interval."""
-    return [
-        Cell(DASH)
-        if row is None
-        else Cell(
-            f"{row['verdict']}: {change(row['relative'], row['low'], row['high'])}",
-            row["verdict"] == "lower",
-            row["verdict"],
-        )
-        for row in rows
-    ]
+def verdict_cells(data: pd.DataFrame, keys: list[str], rows: Iterable[Any]) -> list[Cell]:
+    """Verdicts with the difference in percent of the reference and its interval.
+
+    Args:
+        data: comparisons, of one place and value.
+        keys: what tells its rows apart.
+        rows: the values of ``keys`` in the rows of the table; a dash where there are none.
+    """
+    found = data.set_index(keys).to_dict("index")
+    cells = []
+    for key in rows:
+        row = found.get(key)
+        if row is None:
+            cells.append(Cell(DASH))
+        else:
+            said = change(row["relative"], row["low"], row["high"])
+            verdict = row["verdict"]
+            cells.append(Cell(f"{verdict}: {said}", verdict == "lower", verdict))
+    return cells
 
 
 def training_chance(spread: float) -> str:

@@ -122,10 +122,9 @@ def overview_table(evidence: EvidenceStatistics) -> Table:
     columns = _methods(evidence, evidence.rivals)
     for value, (long, _, _, _) in VALUES.items():
         for place in evidence.places:
-            rows = evidence.overall(place)
-            found = rows[rows["value"] == value].set_index("method").to_dict("index")
-            cells = verdict_cells(found.get(name) for name in evidence.rivals)
-            columns[long, _short_place(place)] = cells
+            found = evidence.overall(place)
+            found = found[found["value"] == value]
+            columns[long, _short_place(place)] = verdict_cells(found, ["method"], evidence.rivals)
     reference = evidence.title(evidence.reference)
     caption = (
         f"{_all_data(evidence)}, clean targets. Difference of the mean over all levels to "
@@ -142,7 +141,6 @@ def verdict_table(evidence: EvidenceStatistics, place: Place) -> Table:
     data = pd.concat([evidence.overall(place, condition) for condition in (CLEAN, RESAMPLED)])
     data = data[data["method"].isin(evidence.rivals)]
     methods = list(dict.fromkeys(data["method"]))
-    found = data.set_index(["value", "condition", "method"]).to_dict("index")
     levels = (
         at(evidence.cells, place).groupby(["value", "method"])["significant"].agg(list).to_dict()
     )
@@ -150,8 +148,8 @@ def verdict_table(evidence: EvidenceStatistics, place: Place) -> Table:
     for value, (long, _, _, _) in VALUES.items():
         for condition in dict.fromkeys(data["condition"]):
             label = "Clean targets" if condition == CLEAN else names.CONDITIONS[condition]
-            rows = (found.get((value, condition, name)) for name in methods)
-            columns[long, label] = verdict_cells(rows)
+            found = data[(data["value"] == value) & (data["condition"] == condition)]
+            columns[long, label] = verdict_cells(found, ["method"], methods)
         tallies = [levels.get((value, name), []) for name in methods]
         columns[long, f"Levels {LOWER} / {HIGHER}"] = [
             f"{x.count('lower')} / {x.count('higher')} of {len(x)}" for x in tallies

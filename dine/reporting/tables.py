@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from dine.config import CONTROL, STAGE1
+from dine.evaluation import statistics
 from dine.evaluation.statistics import comparisons, rounded
 from dine.reporting import names
 from dine.reporting.comparisons import effects, training_chance, verdict_cells
@@ -107,18 +108,15 @@ def published() -> pd.DataFrame:
 def summary(
     metrics: pd.DataFrame, value: str = "cd", scale: float = CD_SCALE, pool_levels: bool = False
 ) -> pd.DataFrame:
-    """Mean and sample standard deviation of ``scale`` times a metric over pairs.
+    """``mean`` and ``std`` of ``scale`` times a metric over ``n`` pairs, averaged over seeds.
 
-    One row per dataset, condition, corruption, level, backbone and method, with the number ``n``
-    of pairs. The standard deviation of a single pair is missing, not zero. With ``pool_levels``
-    all deformation levels count together and ``level`` is missing.
+    The standard deviation of a single pair is missing, not zero. With ``pool_levels`` all
+    deformation levels count together and ``level`` is missing.
     """
-    frame = rounded(metrics)
-    frame[value] = scale * frame[value]
-    if pool_levels:
-        frame["level"] = np.nan
-    grouped = frame.groupby(["dataset", *_SETTING, *_SERIES], dropna=False)[value]
-    return grouped.agg(n="count", mean="mean", std="std").reset_index()
+    scaled = metrics.assign(**{value: scale * metrics[value]})
+    found = statistics.summary(scaled, (value,), pool_levels=pool_levels)
+    named = {"pairs": "n", f"{value}_mean": "mean", f"{value}_sd": "std"}
+    return found.rename(columns=named)[["dataset", *_SETTING, *_SERIES, *named.values()]]
 
 
 def _decided(metrics: pd.DataFrame, value: str, spread: float) -> pd.DataFrame:
@@ -271,8 +269,7 @@ def _by_place(data: pd.DataFrame) -> Columns:
     for place, here in in_order(data, ["dataset", "backbone"]).groupby(
         ["dataset", "backbone"], sort=False
     ):
-        found = here.set_index(keys).to_dict("index")
-        columns[tuple(map(display_name, place))] = verdict_cells(found.get(row) for row in rows)
+        columns[tuple(map(display_name, place))] = verdict_cells(here, keys, rows)
     return columns
 
 
