@@ -154,7 +154,7 @@ def test_contents_lead_to_every_section_and_stay_in_view(tmp_path, figure):
     assert [name for name, _ in contents] == re.findall(r'<h2 id="([^"]+)"', text)
     assert [label for _, label in contents][:3] == ["Findings", "Tables", "What a prior adds"]
     styles = text.partition("<style>")[2].partition("</style>")[0]
-    wide, _, narrow = styles.partition("@media (max-width: 60rem)")
+    wide, _, narrow = styles.partition("@media screen and (max-width: 60rem)")
     assert re.search(r"nav \{[^}]*position: sticky;", wide)
     assert re.search(r"nav \{[^}]*top: 0; flex-flow: row wrap;", narrow)
 
