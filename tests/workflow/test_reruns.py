@@ -104,7 +104,7 @@ CODE = {
     "dine/data/names.py": ALL + DATA + Counter(raw=1),
     "dine/reporting/tables.py": SHOWN,
     "dine/reporting/comparisons.py": SHOWN,
-    "dine/reporting/report.py": Counter(figures=1, html=1),
+    "dine/reporting/run.py": Counter(figures=1, html=1),
     "dine/reporting/figures.py": Counter(figures=1, html=1),
     "dine/reporting/report.html": Counter(html=1),
     "code/my_package/backbones.py": ALL,
