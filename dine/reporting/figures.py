@@ -290,7 +290,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
     found = dict.fromkeys(name for frame in histories.values() for name in frame)
     columns = [
         name
-        for name in [*known, *(name for name in found if name.startswith("val"))]
+        for name in dict.fromkeys([*known, *(name for name in found if name.startswith("val"))])
         if any(name in frame and frame[name].notna().any() for frame in histories.values())
     ]
     if not columns:

@@ -96,12 +96,16 @@ def result_sections(
     at_tables: dict[str, list[Part]] = {}
     figures = []
     for heading, some in (pictures or {}).items():
-        apart = []
+        apart: dict[str, list[Part]] = {}
         for name, shown in some.items():
-            table = _table_of(name)
-            (at_tables.setdefault(table, []) if table else apart).append(shown)
-        if apart:
-            figures.append(PageSection(slug(heading).lower(), heading, [beside(*apart)]))
+            table, (_, _, of) = _table_of(name), name.partition("_")
+            (at_tables if table else apart).setdefault(table or of, []).append(shown)
+        # Figures of one thing are beside each other; where each thing has one, all of them are.
+        rows = list(apart.values())
+        if all(len(row) == 1 for row in rows):
+            rows = [[shown for row in rows for shown in row]] if rows else []
+        shown_rows = [beside(*row) for row in rows]
+        figures.append(PageSection(slug(heading).lower(), heading, shown_rows))
     tables = {
         table.name: beside(table, *at_tables.get(table.name, []))
         for table in all_tables(metrics, spread)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -163,7 +164,8 @@ def qualitative_figure(
     for axes, text in zip(panels[0], ["Before", *titles.values()], strict=True):
         axes.set_title(text, fontsize=11)
     scale = ScalarMappable(norm, _ERROR_COLOURS)
-    figure.colorbar(scale, ax=panels, shrink=0.6, extend="max", label=error)
+    bar = figure.colorbar(scale, ax=panels, shrink=0.6, extend="max")
+    bar.set_label(textwrap.fill(error, int(8 * size[1])), fontsize=9)
     return figure
 
 

@@ -284,6 +284,9 @@ def test_training_figure_draws_what_there_is():
     assert titles == ["Training loss", "Prior penalty", "validation_cd"]
     assert list(lines(shown[2])["DINE-PCA"].get_xdata()) == [0, 5]
     assert [axes.get_yscale() for axes in shown] == ["log", "linear", "log"]
+    known = {"pca": pd.DataFrame({"step": [0, 1], "val_cd": [1.0, 2.0]})}
+    once = figures.training_figure(known, "", "synthetic").axes
+    assert [axes.get_title() for axes in once] == ["Validation Chamfer distance"]
     with pytest.raises(DataError, match="no values to plot"):
         figures.training_figure({"pca": pd.DataFrame({"step": step})}, "", "synthetic")
 

@@ -148,6 +148,21 @@ def test_report_is_one_self_contained_page(tmp_path, figure):
     assert "Beside Table 1" in next_to
 
 
+def test_figures_of_one_thing_stand_beside_each_other(tmp_path, figure):
+    def rows(*names):
+        drawn = {name: html.picture(name, figure) for name in names}
+        sections = report.result_sections(made_up(0.25), {"Priors": drawn})
+        (section,) = [section for section in sections if section.title == "Priors"]
+        assert section.name == "priors"
+        return [[shown.title for shown in row.content] for row in section.items]
+
+    assert rows("spectrum_a", "modes_a", "spectrum_b", "modes_b") == [
+        ["spectrum_a", "modes_a"],
+        ["spectrum_b", "modes_b"],
+    ]
+    assert rows("histogram_a", "histogram_b") == [["histogram_a", "histogram_b"]]
+
+
 def test_contents_lead_to_every_section_and_stay_in_view(tmp_path, figure):
     text = full_page(tmp_path, figure, made_up(0.25))
     contents = re.findall(r'<a href="#([^"]+)">([^<]+)', text.partition("<nav")[2])
