@@ -19,7 +19,7 @@ import pandas as pd
 
 from dine import config as dine_config
 from dine.files import read_json
-from dine.reporting.effects import effects
+from dine.reporting.comparisons import effects
 from dine.reporting.loading import load_metrics
 from dine.reporting.names import METHODS, OBJECTS, display_name
 from dine.results import CLEAN, Results, runs, trained_on

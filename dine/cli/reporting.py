@@ -83,7 +83,7 @@ def figures(results, settings, out):
 
     Example: dine figures --results results --settings @config.yaml --out results/figures
     """
-    from dine.reporting.build import draw_figures
+    from dine.reporting.run import draw_figures
 
     draw_figures(results, settings, out)
 

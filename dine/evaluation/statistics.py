@@ -30,8 +30,10 @@ FEWEST_CLUSTERS = 5
 SIGNIFICANT = 0.05
 
 _GROUP = ["dataset", "backbone", "condition", "corruption"]
-_VERDICT = [*_GROUP, "level", "method", "pairs", "clusters", "mean_method", "mean_reference"]
-_COMPARED = [*_VERDICT, "relative", "value"]
+_COMPARED = [
+    *(*_GROUP, "level", "method", "value", "pairs", "clusters", "mean_method", "mean_reference"),
+    *("difference", "relative", "low", "high", "verdict", "significant"),
+]
 _PAIR = ["pair", "object", "cluster", "level"]
 _NEEDED = ["dataset", "backbone", "method", "seed", *_PAIR, "condition", "corruption"]
 # Levels and corruptions that passed through float32 must still meet; real ones lie far apart.
@@ -412,18 +414,34 @@ def _in_order(table: pd.DataFrame, values: Sequence[str]) -> pd.DataFrame:
 
 
 def comparisons(
-    metrics: pd.DataFrame, reference: str, values: Sequence[str] = ("cd", "mce")
+    metrics: pd.DataFrame,
+    reference: str,
+    values: Sequence[str] = ("cd", "mce"),
+    *,
+    spread: float = 0.0,
 ) -> pd.DataFrame:
-    """:func:`compare` of every method with a reference, within each dataset and backbone.
+    """Every method against a reference, within each dataset and backbone, and what follows.
 
     On the pairs that both were evaluated on, since slow methods may have seen fewer. Methods of the
     backbone ``none`` are compared at every backbone of their dataset. Empty where the reference
-    was not evaluated beside any other method.
+    was not evaluated beside any other method. Columns beside those of :func:`compare`:
+
+    - ``low``, ``high``: 95 % interval of ``relative``, in percent of the reference's mean. It joins
+      two sources of chance as independent: that of the pairs (:func:`cluster_bootstrap`, widened
+      for n clusters by t / 1.96 · √(n / (n − 1)) with the 97.5 % quantile t of n − 1 degrees of
+      freedom: Hesterberg (2015), The American Statistician 69, section 5.3), and that of the
+      training, as another seed or the rounding of another CPU gives another network from the same
+      data: ± 1.96 ``spread`` / √(number of seeds). NaN with fewer than ``FEWEST_CLUSTERS``;
+    - ``verdict``: ``lower`` or ``higher`` where that interval holds no zero, else ``undecided``;
+    - ``significant``: ``lower`` or ``higher`` where p < 0.05 after Holm, else ``none``. It says
+      nothing about how other trainings would differ.
 
     Args:
         metrics: rows of ``metrics.csv``.
         reference: the method that the others are compared with.
         values: columns to compare.
+        spread: standard deviation, over trainings, of a difference between two methods' means, as
+            a share of the reference's mean.
 
     Raises:
         DataError: see :func:`paired`.
@@ -439,22 +457,25 @@ def comparisons(
                 shared = some.groupby(keys)["method"].transform("nunique") == 2
                 if shared.any():
                     found.append(compare(some[shared], method, reference, values=values))
-    return pd.concat(found, ignore_index=True) if found else pd.DataFrame(columns=_COMPARED)
+    if not found:
+        return pd.DataFrame(columns=_COMPARED)
+    table = pd.concat(found, ignore_index=True)
+    low, high = _interval(table, spread)
+    sure = table["p_holm"] < SIGNIFICANT
+    return table.assign(
+        low=low,
+        high=high,
+        verdict=np.select([high < 0, low > 0], ["lower", "higher"], "undecided"),
+        significant=np.select(
+            [sure & (table["difference"] < 0), sure & (table["difference"] > 0)],
+            ["lower", "higher"],
+            "none",
+        ),
+    )
 
 
-def decided(table: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
-    """What follows from each row of :func:`comparisons`: ``low``, ``high`` and ``verdict``.
-
-    ``low`` to ``high`` is the 95 % interval of ``relative``, in percent of the reference's mean;
-    ``verdict`` is ``lower`` or ``higher`` where that holds no zero, otherwise ``undecided``.
-
-    The interval joins two sources of chance as independent: that of the pairs
-    (:func:`cluster_bootstrap`, widened for n clusters by t / 1.96 · √(n / (n − 1)) with the 97.5 %
-    quantile t of n − 1 degrees of freedom: Hesterberg (2015), The American Statistician 69,
-    section 5.3), and that of the training, as another seed or the rounding of another CPU gives
-    another network from the same data: ± 1.96 ``spread`` / √(number of seeds). With fewer than
-    ``FEWEST_CLUSTERS`` there is no interval, and nothing is decided.
-    """
+def _interval(table: pd.DataFrame, spread: float) -> tuple[pd.Series, pd.Series]:
+    """``low`` and ``high`` of :func:`comparisons`."""
     percent = 100 / table["mean_reference"].where(table["mean_reference"] > 0)
     chance = 1.96 * 100 * spread / np.sqrt(table[["seeds_method", "seeds_reference"]].min(axis=1))
     clusters = table["clusters"].where(table["clusters"] >= FEWEST_CLUSTERS)
@@ -464,43 +485,7 @@ def decided(table: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
         + sign * np.hypot((table[end] - table["difference"]) * percent * wider, chance)
         for sign, end in ((-1, "ci_low"), (1, "ci_high"))
     )
-    verdict = np.select([high < 0, low > 0], ["lower", "higher"], "undecided")
-    return pd.DataFrame({"low": low, "high": high, "verdict": verdict})
-
-
-def significant(table: pd.DataFrame) -> np.ndarray:
-    """``lower`` or ``higher`` by row of :func:`comparisons` where p < 0.05 after Holm, or ``none``.
-
-    Unlike :func:`decided` it says nothing about how other trainings would differ.
-    """
-    sure = (table["p_holm"] < SIGNIFICANT) & (table["difference"] != 0)
-    return np.select([sure & (table["difference"] < 0), sure], ["lower", "higher"], "none")
-
-
-def verdicts(
-    metrics: pd.DataFrame, reference: str, value: str = "cd", *, spread: float = 0.0
-) -> pd.DataFrame:
-    """Every method against a reference: by how much it differs, and whether that is decided.
-
-    One row per dataset, backbone, method, condition, corruption and deformation level, and of all
-    levels together, whose ``level`` is NaN; columns beside these: ``pairs``, ``clusters``,
-    ``mean_method``, ``mean_reference``, and, in percent of the reference's mean, ``relative`` and
-    what :func:`decided` says: its interval ``low`` to ``high`` and the ``verdict``.
-
-    Args:
-        metrics: rows of ``metrics.csv``.
-        reference: the method that the others are compared with, where it was evaluated too.
-        value: column to compare.
-        spread: standard deviation, over trainings, of a difference between two methods' means, as
-            a share of the reference's mean.
-
-    Raises:
-        DataError: see :func:`paired`.
-    """
-    table = comparisons(metrics, reference, (value,))
-    return table[[*_VERDICT, "relative"]].join(
-        decided(table, spread) if len(table) else pd.DataFrame(columns=["low", "high", "verdict"])
-    )
+    return low, high
 
 
 def _levels(rows: pd.DataFrame) -> Iterable[tuple[float, pd.DataFrame]]:
@@ -563,11 +548,13 @@ def _seed_spread(rows: pd.DataFrame, value: str) -> dict[tuple, dict[str, float]
     return found
 
 
-def summary(metrics: pd.DataFrame, *, pool_levels: bool = False) -> pd.DataFrame:
+def summary(
+    metrics: pd.DataFrame, values: Sequence[str] = SUMMARISED, *, pool_levels: bool = False
+) -> pd.DataFrame:
     """Mean and spread of every method by dataset, backbone, condition, corruption and level.
 
-    Values are averaged over seeds per pair first. ``pairs`` and ``seeds`` count; for each metric in
-    ``SUMMARISED``, ``<metric>_mean`` and ``<metric>_sd`` are mean and standard deviation (ddof = 1)
+    Values are averaged over seeds per pair first. ``pairs`` and ``seeds`` count; for each metric of
+    ``values``, ``<metric>_mean`` and ``<metric>_sd`` are mean and standard deviation (ddof = 1)
     over pairs, and ``<metric>_seed_sd`` the standard deviation over seeds of their means over pairs
     (NaN with one seed). ``mce_pairs_median`` and ``mce_pairs_p95`` are over pairs;
     ``failure_rate`` is the share of the pairs with an ``mce`` above 0.1, and its
@@ -575,27 +562,29 @@ def summary(metrics: pd.DataFrame, *, pool_levels: bool = False) -> pd.DataFrame
 
     Args:
         metrics: rows of ``metrics.csv``.
+        values: metrics to summarise.
         pool_levels: all deformation levels together; ``level`` is then NaN.
 
     Raises:
         DataError: a column is missing, a pair was evaluated twice, or seeds of one method were
             evaluated on different pairs.
     """
-    rows = _tidy(metrics, SUMMARISED)
+    measured = list(dict.fromkeys([*values, "mce"]))
+    rows = _tidy(metrics, measured)
     keys = ["dataset", "backbone", "method", "condition", "corruption", "level"]
-    values = [*SUMMARISED, "failure_rate"]
+    found = [*measured, "failure_rate"]
 
     def with_failures(frame: pd.DataFrame) -> pd.DataFrame:
         failed = (frame["mce"] > FAILURE).astype(float).where(frame["mce"].notna())
         frame = frame.assign(failure_rate=failed)
         return frame.assign(level=np.nan) if pool_levels else frame
 
-    over_pairs = with_failures(_over_seeds(rows, *SUMMARISED)).groupby(keys, dropna=False)
-    by_seed = with_failures(rows).groupby([*keys, "seed"], dropna=False)[values].mean()
-    mean, sd = over_pairs[values].mean(), over_pairs[values].std(ddof=1)
+    over_pairs = with_failures(_over_seeds(rows, *measured)).groupby(keys, dropna=False)
+    by_seed = with_failures(rows).groupby([*keys, "seed"], dropna=False)[found].mean()
+    mean, sd = over_pairs[found].mean(), over_pairs[found].std(ddof=1)
     seed_sd = by_seed.groupby(level=keys, dropna=False).std(ddof=1)
     columns = {"pairs": over_pairs.size(), "seeds": over_pairs["seeds"].max()}
-    for name in SUMMARISED:
+    for name in values:
         columns |= {f"{name}_mean": mean[name], f"{name}_sd": sd[name]}
         columns[f"{name}_seed_sd"] = seed_sd[name]
         if name == "mce":

@@ -10,8 +10,9 @@ import numpy as np
 from dine.errors import DataError
 from dine.evaluation.conditions import Condition, evaluation_conditions
 from dine.evaluation.predictions import Prediction, read_predictions
-from dine.reporting.figures import ExamplePair, qualitative_figure, save_figure
+from dine.reporting.figures import save_figure
 from dine.reporting.names import display_name, setting_name
+from dine.reporting.views import ExamplePair, qualitative_figure
 from dine.results import CLEAN
 
 

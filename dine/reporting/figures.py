@@ -7,28 +7,25 @@ global state. Every figure says where its data come from.
 from __future__ import annotations
 
 import os
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from dine.config import STAGE1
 from dine.errors import DataError
+from dine.evaluation.statistics import NO_BACKBONE
 from dine.files import atomic_path
-from dine.io import announced
 from dine.reporting import names
-from dine.reporting.names import CD_SCALE, VALUES, display_name, rank
+from dine.reporting.comparisons import GROUPS, LARGE, PAPER_PRIOR, EvidenceStatistics, at
+from dine.reporting.names import CD_SCALE, VALUES, display_name, rank, signed
 from dine.reporting.tables import published, summary
-from dine.results import CLEAN, condition_key
-
-if TYPE_CHECKING:
-    from dine.data.pairs import PairSet
+from dine.results import CLEAN
 
 # Okabe-Ito colours, which stay apart for colour-blind readers; the markers differ as well.
 _STYLES = {
@@ -41,10 +38,8 @@ _OTHER_STYLES = [
     *(("#CC79A7", "v"), ("#E69F00", "P"), ("#56B4E9", "X"), ("#000000", "<")),
     *(("#8C6D31", ">"), ("#7B4173", "p"), ("#A6BD2B", "h"), ("#9E9E9E", "d")),
 ]
-_ERROR_COLOURS = "coolwarm"
-_UNIT = "×10⁻⁴"
-_POINTS = {"linewidth": 0, "rasterized": True}  # thousands of paths in a PDF are slow to show
-_SMALL = {"fontsize": 8, "frameon": False}
+UNIT = "×10⁻⁴"
+SMALL = {"fontsize": 8, "frameon": False}
 
 
 def method_styles(methods: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -79,10 +74,22 @@ def save_figure(figure: Figure, path_stem: str | os.PathLike) -> list[Path]:
 def new_figure(width: float, height: float, title: str, origin: str, note: str = "") -> Figure:
     """An empty figure, inches; its title says where the data come from."""
     figure = Figure(figsize=(width, height), layout="constrained")
-    figure.suptitle(f"{plain(title)} ({names.ORIGINS[origin]})", fontsize=12)
+    title = f"{plain(title)} ({names.ORIGINS[origin]})"
+    figure.suptitle(textwrap.fill(title, int(11.5 * width)), fontsize=11)
     if note:
-        figure.supxlabel(note, fontsize=8, color="#444444")
+        figure.supxlabel(textwrap.fill(note, int(17 * width)), fontsize=8, color="#444444")
     return figure
+
+
+def legend_below(figure: Figure, panels: Iterable[Any], columns: int, note: str = "") -> None:
+    """One legend for all panels, of the fullest one, with a note above."""
+    fullest = max(panels, key=lambda axes: len(axes.get_legend_handles_labels()[1]))
+    handles, labels = fullest.get_legend_handles_labels()
+    title = textwrap.fill(note, int(17 * figure.get_figwidth()))
+    figure.legend(
+        handles, labels, title=title, title_fontsize=8, loc="outside lower center", ncols=columns,
+        **SMALL,
+    )  # fmt: skip
 
 
 def plain_axes(axes: Any) -> Any:
@@ -124,18 +131,23 @@ def distance_figure(dataset: str, metrics: pd.DataFrame, condition: str = CLEAN)
         "noise": ("noise", "Noise σ"),
     }[condition]
     title = f"{display_name(dataset)}: {title}"
-    width = 5.2 * len(backbones) + 0.4
-    figure = new_figure(width, 4.3, title, str(rows["origin"].iloc[0]), note)
-    panels = figure.subplots(1, len(backbones), sharey=True, squeeze=False)[0]
+    # Beside a table of up to two backbones; that of more is too wide for anything beside it.
+    down, across = (len(backbones), 1) if len(backbones) < 3 else (1, len(backbones))
+    size = (5.2 if across == 1 else 4.2 * across, 2.9 * down + 1.8)
+    figure = new_figure(*size, title, str(rows["origin"].iloc[0]))
+    panels = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False).ravel()
     for axes, backbone in zip(panels, backbones, strict=True):
         for method, style in styles.items():
             here = [x[(x["backbone"] == backbone) & (x["method"] == method)] for x in (ours, paper)]
             _distance_lines(axes, *(x.sort_values(key) for x in here), key, style)
         axes.set_title(display_name(backbone), fontsize=11)
-        axes.set_xlabel(label)
-        axes.set_ylim(bottom=0)
-        plain_axes(axes).legend(**_SMALL)
-    panels[0].set_ylabel(f"Chamfer distance {_UNIT}")
+        plain_axes(axes)
+        if axes.get_subplotspec().is_last_row():
+            axes.set_xlabel(label)
+        if axes.get_subplotspec().is_first_col():
+            axes.set_ylabel(f"Chamfer distance {UNIT}")
+    panels[0].set_ylim(bottom=0)
+    legend_below(figure, panels, 2 if across == 1 else 4, note)
     return figure
 
 
@@ -156,26 +168,6 @@ def _distance_lines(
 
 
 # --------------------------------------------------------------------------- point errors
-
-
-def read_group(path: str | os.PathLike, condition: str, field: str) -> tuple[np.ndarray, ...]:
-    """``(pair names, values)`` of one condition from a point error or prediction file.
-
-    ``condition`` is a key such as ``deformation`` or ``outliers_25``.
-
-    Raises:
-        DataError: the file cannot be read or lacks the condition or the field.
-    """
-    try:
-        with announced.hdf5(path) as stream:
-            group = stream[condition]
-            return group["pair"].asstr()[:], group[field][:]
-    except FileNotFoundError as error:
-        raise DataError(f"{path} does not exist.") from error
-    except KeyError as error:
-        raise DataError(f"{path} holds no {condition}/{field}; evaluate that condition.") from error
-    except OSError as error:
-        raise DataError(f"{path} is not a readable HDF5 file ({error}).") from error
 
 
 def histogram_figure(errors: Mapping[str, np.ndarray], title: str, origin: str) -> Figure:
@@ -203,187 +195,11 @@ def histogram_figure(errors: Mapping[str, np.ndarray], title: str, origin: str) 
             label=f"{display_name(method)}: {share:.2f} % above",
         )
     axes.axvline(CD_SCALE * threshold, color="black", linestyle=":", linewidth=1)
-    axes.set_xlabel(f"Squared distance of a registered point to the clean target {_UNIT}")
+    axes.set_xlabel(f"Squared distance of a registered point to the clean target {UNIT}")
     axes.set_ylabel("Points")
-    title = f"Tail above {CD_SCALE * threshold:.4g} {_UNIT} (dotted)"
+    title = f"Tail above {CD_SCALE * threshold:.4g} {UNIT} (dotted)"
     axes.legend(title=title, fontsize=9, title_fontsize=9, frameon=False, alignment="left")
     return figure
-
-
-# ---------------------------------------------------------------------------- qualitative
-
-
-@dataclass(frozen=True)
-class ExamplePair:
-    """One test pair for the qualitative figure.
-
-    Attributes:
-        label: of the row.
-        source: (N, 3).
-        target: (M, 3), without corruption.
-        registered: (N, 3) registered points by method.
-        errors: (N,) of these, as they are to be coloured.
-        seen: (M, 3) the target that methods saw, if it is not the one without corruption.
-    """
-
-    label: str
-    source: np.ndarray
-    target: np.ndarray
-    registered: Mapping[str, np.ndarray]
-    errors: Mapping[str, np.ndarray]
-    seen: np.ndarray | None = None
-
-
-def pick_examples(dataset: str, backbone: str, metrics: pd.DataFrame) -> list[tuple[str, str, str]]:
-    """``(condition key, pair, label)`` of a typical hard case of every condition.
-
-    From the strongest corruption of each condition, and there the largest deformation level, the
-    pair with the median error of Stage 1: a rule, so that no case is chosen by its looks.
-    """
-    of_place = (metrics["dataset"] == dataset) & (metrics["backbone"] == backbone)
-    rows = metrics[of_place & (metrics["method"] == "stage1")]
-    picks = []
-    for condition in (CLEAN, "noise", "outliers"):
-        part = rows[rows["condition"] == condition]
-        if part.empty:
-            continue
-        part = part[part["corruption"] == part["corruption"].max()]
-        if part["level"].notna().any():
-            part = part[part["level"] == part["level"].max()]
-        part = part.sort_values(["cd", "pair"], ignore_index=True)
-        row = part.iloc[(len(part) - 1) // 2]
-        label = names.setting_name(condition, row["corruption"])
-        if not np.isnan(row["level"]):
-            label += f"\nlevel {row['level']:g}"
-        picks.append((condition_key(condition, row["corruption"]), str(row["pair"]), label))
-    return picks
-
-
-def load_examples(
-    picks: Sequence[tuple[str, str, str]],
-    pairs: PairSet,
-    predictions: Mapping[str, str | os.PathLike],
-    point_errors: Mapping[str, str | os.PathLike],
-) -> list[ExamplePair]:
-    """Gather the clouds of ``pick_examples``; the two mappings give one file per method.
-
-    Errors are squared distances to the clean target, in the unit of the tables.
-    """
-    listed = np.asarray(pairs.name).astype(str)
-    examples = []
-    for key, pair, label in picks:
-        index = _find(listed, pair, "the pairs")
-        source = np.asarray(pairs.source[index])
-        registered, errors = {}, {}
-        for method, path in predictions.items():
-            known, displacement = read_group(path, key, "displacement")
-            registered[method] = source + displacement[_find(known, pair, path)]
-            known, squared = read_group(point_errors[method], key, "squared_distance")
-            errors[method] = CD_SCALE * squared[_find(known, pair, point_errors[method])]
-        examples.append(
-            ExamplePair(label, source, np.asarray(pairs.target[index]), registered, errors)
-        )
-    return examples
-
-
-def _find(listed: np.ndarray, pair: str, where: Any) -> int:
-    found = np.flatnonzero(listed == pair)
-    if not len(found):
-        raise DataError(f"Pair {pair} is not in {where}; evaluate the same pairs again.")
-    return int(found[0])
-
-
-def qualitative_figure(
-    examples: Sequence[ExamplePair],
-    title: str,
-    origin: str,
-    *,
-    titles: Mapping[str, str] | None = None,
-    error: str = f"Squared distance to the clean target {_UNIT}",
-    note: str = "Grey: clean target. Median Stage 1 case at the largest level and strongest "
-    "corruption.",
-) -> Figure:
-    """3D views: source and target before, then each method's result coloured by point error.
-
-    One colour scale for all panels, up to the 98th percentile of the errors shown.
-
-    Args:
-        examples: one row each.
-        title: of the figure.
-        origin: of the data.
-        titles: of the methods, in the order of the columns; by default that of the tables.
-        error: what the colours mean.
-        note: beneath the figure.
-    """
-    known = examples[0].registered
-    titles = titles or {name: display_name(name) for name in method_styles(known)}
-    titles = {name: plain(text) for name, text in titles.items() if name in known}
-    shown = np.concatenate([e for example in examples for e in example.errors.values()])
-    norm = Normalize(0, float(np.percentile(shown, 98)))
-    size = (2.6 * (1 + len(titles)) + 1, 2.1 * len(examples) + 0.9)
-    figure = new_figure(*size, title, origin, note)
-    panels = _views(figure, len(examples), 1 + len(titles))
-    for example, line in zip(examples, panels, strict=True):
-        _example_row(line, example, list(titles), norm)
-    panels[0, 0].legend(**_SMALL, loc="upper left", markerscale=2)
-    for axes, text in zip(panels[0], ["Before", *titles.values()], strict=True):
-        axes.set_title(text, fontsize=11)
-    scale = ScalarMappable(norm, _ERROR_COLOURS)
-    figure.colorbar(scale, ax=panels, shrink=0.6, extend="max", label=error)
-    return figure
-
-
-def _example_row(
-    line: Sequence[Any], example: ExamplePair, methods: Sequence[str], norm: Normalize
-) -> None:
-    centre, rotation = _principal_frame(example.source)
-    source, target = ((x - centre) @ rotation for x in (example.source, example.target))
-    limits = _cube(np.concatenate([source, target]))
-    for axes in line:
-        _bare_axes(axes, limits)
-    seen = target if example.seen is None else (example.seen - centre) @ rotation
-    line[0].scatter(*source.T, s=4, color="#E69F00", label="source", **_POINTS)
-    line[0].scatter(*seen.T, s=4, color="#999999", label="target", **_POINTS)
-    line[0].text2D(
-        -0.02, 0.5, example.label, rotation=90, va="center", ha="right",
-        transform=line[0].transAxes, multialignment="center",
-    )  # fmt: skip
-    for axes, method in zip(line[1:], methods, strict=True):
-        axes.scatter(*target.T, s=2, color="#BBBBBB", alpha=0.5, **_POINTS)
-        cloud = (example.registered[method] - centre) @ rotation
-        colours = {"c": example.errors[method], "cmap": _ERROR_COLOURS, "norm": norm}
-        axes.scatter(*cloud.T, s=6, **colours, depthshade=False, **_POINTS)
-
-
-def _views(figure: Figure, down: int, across: int) -> np.ndarray:
-    """Panels (down, across) to look at clouds in."""
-    return figure.subplots(down, across, squeeze=False, subplot_kw={"projection": "3d"})
-
-
-def _principal_frame(cloud: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and rotation that lay a cloud's broad side flat, so that a surface faces the viewer.
-
-    The signs are fixed by the largest entries, since those of singular vectors are arbitrary.
-    """
-    centre = cloud.mean(axis=0)
-    _, _, axes = np.linalg.svd(cloud - centre, full_matrices=False)
-    largest = np.abs(axes).argmax(axis=1)
-    axes = axes * np.sign(axes[np.arange(3), largest])[:, None]
-    axes[2] = np.cross(axes[0], axes[1])
-    return centre, axes.T
-
-
-def _cube(cloud: np.ndarray) -> list[tuple[float, float]]:
-    middle = (cloud.min(axis=0) + cloud.max(axis=0)) / 2
-    half = float(np.ptp(cloud, axis=0).max()) / 2
-    return [(centre - half, centre + half) for centre in middle]
-
-
-def _bare_axes(axes: Any, limits: list[tuple[float, float]]) -> None:
-    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
-    axes.set_box_aspect((1, 1, 1), zoom=1.4)
-    axes.view_init(elev=62, azim=-75)
-    axes.set_axis_off()
 
 
 # ------------------------------------------------------------------------------- training
@@ -431,7 +247,7 @@ def search_figure(
         axes.set_xlabel("Prior weight λ" if x == "lambda" else "Roughness of the field")
         axes.set_ylabel(VALUES[value][0])
         plain_axes(axes)
-    drawn[0].legend(**_SMALL)
+    drawn[0].legend(**SMALL)
     return figure
 
 
@@ -448,7 +264,7 @@ def _search_lines(
         curve = curve[curve["lambda"] > 0]
     else:
         axes.plot(control[x], scale * control[value], "s", color="#555555", zorder=4, label="λ = 0")
-        axes.legend(**_SMALL)
+        axes.legend(**SMALL)
     for prior, (colour, marker) in method_styles(curve["prior"]).items():
         line = curve[curve["prior"] == prior].sort_values("lambda")
         label = plain(titles.get(prior) or display_name(prior)) if x == "lambda" else None
@@ -474,7 +290,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
     found = dict.fromkeys(name for frame in histories.values() for name in frame)
     columns = [
         name
-        for name in [*known, *(name for name in found if name.startswith("val"))]
+        for name in dict.fromkeys([*known, *(name for name in found if name.startswith("val"))])
         if any(name in frame and frame[name].notna().any() for frame in histories.values())
     ]
     if not columns:
@@ -500,7 +316,7 @@ def training_figure(histories: Mapping[str, pd.DataFrame], title: str, origin: s
         plain_axes(axes)
     for axes in panels[len(columns) :]:
         axes.set_visible(False)
-    panels[0].legend(**_SMALL)
+    panels[0].legend(**SMALL)
     return figure
 
 
@@ -513,8 +329,8 @@ def pca_spectrum_figure(
     """Explained variance per component (log) and its cumulative share."""
     component = np.arange(1, len(explained_variance) + 1)
     cumulative = 100 * np.cumsum(explained_variance_ratio)
-    figure = new_figure(9.6, 3.8, title, origin)
-    left, right = figure.subplots(1, 2)
+    figure = new_figure(4.6, 5.6, title, origin)
+    left, right = figure.subplots(2, 1)
     colour = _STYLES["pca"][0]
     left.semilogy(component, explained_variance, color=colour, marker=".")
     left.set_ylabel("Explained variance")
@@ -533,70 +349,191 @@ def pca_spectrum_figure(
     return figure
 
 
-def pca_modes_figure(
-    mean: np.ndarray,
-    modes: np.ndarray,
-    explained_variance: np.ndarray,
-    source: np.ndarray,
-    title: str,
-    origin: str,
-) -> Figure:
-    """The first modes on the source, at −2 and +2 standard deviations around the mean field.
+# ------------------------------------------------------------------------------- evidence
 
-    ``modes`` (n_c, N, 3) are displacements per unit of a coefficient whose variance is
-    ``explained_variance``; ``mean`` and ``source`` are (N, 3). Colour and arrows show the mode's
-    own share of the displacement.
-    """
-    count = min(3, len(modes))
-    steps = 2 * np.sqrt(explained_variance[:count])[:, None, None] * modes[:count]
-    lengths = np.linalg.norm(steps, axis=2)
-    norm = Normalize(0, float(lengths.max()) or 1.0)
-    centre, rotation = _principal_frame(source)
-    base = (source + mean - centre) @ rotation
-    limits = _cube(
-        np.concatenate([(base + sign * s @ rotation) for s in steps for sign in (-1, 1)])
+_COLOURS = {
+    "none": "#999999",
+    "classical": "#E69F00",
+    "network": "#D55E00",
+    "control": "#555555",
+    "prior": "#0072B2",
+    "data term": "#CC79A7",
+    "test time": "#009E73",
+    "other": "#56B4E9",
+}
+_MARKERS = "o^sDvP*X<>phd"
+_BESIDE = {"loc": "outside right upper", "fontsize": 8, "frameon": False}
+
+
+def forest_figure(evidence: EvidenceStatistics, place: tuple[str, str]) -> Figure | None:
+    """Relative difference of the mean at large levels to the reference, one row per method."""
+    data = at(evidence.large, place)
+    methods = [name for name in evidence.rivals if (data["method"] == name).any()]
+    if not methods:
+        return None
+    # Top to bottom: the heading of each group, then its methods.
+    rows: list[tuple[str, str | None]] = []
+    for name in methods:
+        group = evidence.methods[name].group
+        rows += [(group, None)] if not rows or rows[-1][0] != group else []
+        rows.append((group, name))
+    where = ", ".join(display_name(x) for x in place if x != NO_BACKBONE)
+    figure = new_figure(
+        10.4,
+        1.7 + 0.27 * len(rows),
+        f"{where}: difference to {evidence.title(evidence.reference)}",
+        evidence.origin(place[0]),
+        f"All levels from {LARGE:g} on. Bars: 95 % bootstrap interval over objects. Filled: "
+        "p < 0.05 (Wilcoxon). Triangles: beyond the axis.",
     )
-    arrows = np.linspace(0, len(source) - 1, min(len(source), 150)).astype(int)
-    note = "Points: mean field ± 2 standard deviations of one mode. Arrows: from the mean field."
-    figure = new_figure(3.1 * count + 1, 5.6, title, origin, note)
-    panels = _views(figure, 2, count)
-    for line, sign in zip(panels, (-1, 1), strict=True):
-        for mode, axes in enumerate(line):
-            step = sign * steps[mode] @ rotation
-            _bare_axes(axes, limits)
-            _coloured(axes, base + step, lengths[mode], norm)
-            axes.quiver(
-                *base[arrows].T, *step[arrows].T, color="#333333", linewidth=0.5, alpha=0.7,
-                arrow_length_ratio=0.3,
-            )  # fmt: skip
-            axes.set_title(f"Mode {mode + 1}, {'+' if sign > 0 else '−'}2 sd", fontsize=10)
-    scale = ScalarMappable(norm, "viridis")
-    figure.colorbar(scale, ax=panels, shrink=0.6, label="Displacement by the mode")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, value in zip(panels, VALUES, strict=True):
+        some = data[data["value"] == value].set_index("method")
+        ends = 100 * some[["ci_low", "ci_high"]].div(some["mean_reference"], axis=0)
+        some = some.assign(low=ends["ci_low"], high=ends["ci_high"])
+        shown = ["relative", "low", "high"]
+        inner = [name for name in some.index if name in evidence.candidates] or list(some.index)
+        reach = float(np.clip(1.1 * some.loc[inner, shown].abs().max(axis=None), 5, 100))
+        for y, (group, name) in enumerate(rows):
+            if name in some.index:
+                _forest_row(axes, y, some.loc[name], _COLOURS[group], reach)
+        axes.axvline(0, color="black", linewidth=1)
+        axes.set_xlim(-reach, reach)
+        name = VALUES[value][0].partition(" ×")[0]
+        axes.set_xlabel(f"{name}: lower ← difference (%) → higher", fontsize=9)
+        axes.tick_params(axis="y", length=0)
+        plain_axes(axes).grid(axis="y", visible=False)
+    panels[0].set_ylim(len(rows) - 0.4, -0.6)
+    texts = [GROUPS[g] if n is None else plain(evidence.title(n)) for g, n in rows]
+    panels[0].set_yticks(range(len(rows)), texts, fontsize=9)
+    for label, (_, name) in zip(panels[0].get_yticklabels(), rows, strict=True):
+        label.set_fontweight("bold" if name is None else "normal")
     return figure
 
 
-def _coloured(axes: Any, cloud: np.ndarray, values: np.ndarray, norm: Normalize) -> None:
-    axes.scatter(*cloud.T, s=5, c=values, cmap="viridis", norm=norm, **_POINTS)
+def _forest_row(axes: Any, y: int, row: pd.Series, colour: str, reach: float) -> None:
+    x = row["relative"]
+    dot = {
+        "color": colour,
+        "markerfacecolor": "white" if row["significant"] == "none" else colour,
+        "ms": 6,
+    }
+    if abs(x) > reach:
+        axes.plot(0.98 * np.sign(x) * reach, y, ">" if x > 0 else "<", **dot)
+    else:
+        axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=1.6)
+        axes.plot(x, y, "o", **dot)
+    axes.text(
+        1.02, y, f"{signed(x, 1)} %", transform=axes.get_yaxis_transform(), va="center",
+        fontsize=8, color="#333333",
+    )  # fmt: skip
 
 
-def prior_samples_figure(
-    source: np.ndarray, samples: np.ndarray, title: str, origin: str
-) -> Figure:
-    """A source (N, 3) moved by fields (S, N, 3) that were drawn from a prior."""
-    centre, rotation = _principal_frame(source)
-    lengths = np.linalg.norm(samples, axis=2)
-    # A prior with heavy tails must not hide what most of its points do.
-    norm = Normalize(0, float(np.quantile(lengths, 0.98)) or 1.0)
-    base = (source - centre) @ rotation
-    limits = _cube(np.concatenate([base * 1.3, base]))
-    count = len(samples)
-    figure = new_figure(3.1 * (count + 1) + 0.8, 3.4, title, origin, "Left: the source as it is.")
-    panels = _views(figure, 1, count + 1)
-    fields = [np.zeros_like(source), *samples]
-    for number, (axes, field) in enumerate(zip(panels[0], fields, strict=True)):
-        _bare_axes(axes, limits)
-        _coloured(axes, base + field @ rotation, np.linalg.norm(field, axis=1), norm)
-        axes.set_title("Source" if number == 0 else f"Sample {number}", fontsize=10)
-    scale = ScalarMappable(norm, "viridis")
-    figure.colorbar(scale, ax=panels, shrink=0.7, label="Displacement")
+def main_methods(evidence: EvidenceStatistics, dataset: str) -> list[str]:
+    """Few enough to tell their lines apart: the paper's, and the best of each other group."""
+    places = [place for place in evidence.judged if place[0] == dataset]
+
+    def best(methods: Sequence[str]) -> list[str]:
+        return list(evidence.ranking(methods, "mce", places).index[:1])
+
+    network = [STAGE1] if STAGE1 in evidence.methods else evidence.of_group("network")[:1]
+    priors = evidence.of_group("prior")
+    picked = [*best(evidence.classical), *network, evidence.reference]
+    picked += [PAPER_PRIOR] if PAPER_PRIOR in evidence.methods else []
+    picked += best([name for name in priors if name != PAPER_PRIOR])
+    for group in ("data term", "test time"):
+        picked += best(evidence.of_group(group))
+    return list(dict.fromkeys(picked))
+
+
+def level_figure(evidence: EvidenceStatistics, dataset: str) -> Figure | None:
+    """Mean correspondence error of the main methods over levels; beneath, against the reference."""
+    means = evidence.by_level
+    methods = main_methods(evidence, dataset)
+    means = means[(means["dataset"] == dataset) & means["method"].isin(methods) & ~means["partial"]]
+    if means["mce_mean"].isna().all():
+        return None
+    backbones = [backbone for name, backbone in evidence.places if name == dataset]
+    count = len(backbones)
+    figure = new_figure(
+        4.6 * count + 2.2,
+        6.6,
+        f"{display_name(dataset)}: correspondence error over levels",
+        evidence.origin(dataset),
+        "Below: filled where p < 0.05 after Holm. Best of a group: at levels from "
+        f"{LARGE:g} on. Curves that leave the lower panels are cut off.",
+    )
+    panels = figure.subplots(
+        2, count, sharex=True, sharey="row", squeeze=False, height_ratios=(3, 2)
+    )
+    reach = 5.0
+    for (above, below), backbone in zip(panels.T, backbones, strict=True):
+        here = at(means, (dataset, backbone)).sort_values("level")
+        cells = at(evidence.cells, (dataset, backbone)).query("value == 'mce'")
+        below.axhline(0, color="#555555", linewidth=1)
+        for method, (colour, marker) in method_styles(methods).items():
+            line = here[here["method"] == method]
+            dot = {"marker": marker, "color": colour, "ms": 5}
+            above.plot(line["level"], line["mce_mean"], **dot, label=plain(evidence.title(method)))
+            line = cells[cells["method"] == method].sort_values("level")
+            below.plot(line["level"], line["relative"], color=colour, linewidth=1)
+            sure = line["significant"] != "none"
+            for some, face in ((line[sure], colour), (line[~sure], "white")):
+                style = dot | {"linestyle": "none", "markerfacecolor": face}
+                below.plot(some["level"], some["relative"], **style)
+            if method in evidence.candidates and evidence.methods[method].group != "network":
+                reach = np.fmax(reach, 1.15 * line["relative"].abs().max())
+        above.set_title(display_name(backbone) if backbone != NO_BACKBONE else "", fontsize=11)
+        below.set_xlabel("Deformation level")
+        for axes in (above, below):
+            plain_axes(axes)
+    panels[0, 0].set_ylim(bottom=0)
+    panels[1, 0].set_ylim(-min(reach, 100), min(reach, 100))
+    panels[0, 0].set_ylabel("Mean correspondence error")
+    panels[1, 0].set_ylabel("Against the reference (%)")
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), **_BESIDE)
+    return figure
+
+
+def plausibility_figure(evidence: EvidenceStatistics, dataset: str) -> Figure | None:
+    """Accuracy against roughness and folding, one point per method and backbone."""
+    shown = [n for n in evidence.methods if n in (evidence.reference, *evidence.rivals)]
+    means = evidence.pooled
+    means = means[(means["dataset"] == dataset) & means["method"].isin(shown)]
+    means = means[means["mce_mean"].notna()]
+    if means.empty:
+        return None
+    methods = [name for name in shown if (means["method"] == name).any()]
+    backbones = [backbone for name, backbone in evidence.places if name == dataset]
+    figure = new_figure(
+        10.6,
+        0.6 + max(3.4 * len(backbones), 0.2 * len(methods) + 1.2),
+        f"{display_name(dataset)}: accuracy against plausibility",
+        evidence.origin(dataset),
+        "Clean targets, all levels. Dashed: mean roughness of the true fields. Best: low, and near "
+        "the dashed line.",
+    )
+    panels = figure.subplots(len(backbones), 2, sharey="row", sharex="col", squeeze=False)
+    handles = {}
+    for name in methods:
+        group = evidence.methods[name].group
+        marker = _MARKERS[evidence.of_group(group).index(name) % len(_MARKERS)]
+        edge = "black" if name == evidence.reference else "white"
+        style = {"color": _COLOURS[group], "ms": 8, "markeredgecolor": edge}
+        for line, backbone in zip(panels, backbones, strict=True):
+            row = at(means, (dataset, backbone)).query("method == @name")
+            for axes, column, scale in zip(line, ("roughness", "folding"), (1, 100), strict=True):
+                (handle,) = axes.plot(
+                    scale * row[f"{column}_mean"], row["mce_mean"], marker, **style
+                )
+        handles[plain(evidence.title(name))] = handle
+    for line, backbone in zip(panels, backbones, strict=True):
+        line[0].axvline(evidence.roughness_true[dataset], color="black", linestyle="--", lw=1)
+        label = f"{display_name(backbone)}\n" if backbone != NO_BACKBONE else ""
+        line[0].set_ylabel(f"{label}Mean correspondence error", fontsize=9)
+    for axes in panels.flat:
+        plain_axes(axes)
+    panels[-1, 0].set_xlabel("Roughness of the field")
+    panels[-1, 1].set_xlabel("Folding (% of the places)")
+    figure.legend(list(handles.values()), list(handles), **_BESIDE)
     return figure

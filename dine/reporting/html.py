@@ -1,13 +1,13 @@
-"""One self-contained HTML page: contents, sections of text, tables and figures."""
+"""One self-contained HTML page: contents that stay in view; text, tables and figures."""
 
 from __future__ import annotations
 
 import base64
 import io
+import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -18,47 +18,30 @@ from PIL import Image
 from dine.errors import DataError
 from dine.files import write_text
 from dine.reporting import names
-from dine.reporting.table import Cell, Table
+from dine.reporting.table import Table, laid_out
 from dine.results import trained_on
 
 _PIXELS_PER_DOT = 96 / 150
-# Figures have few colours; a palette takes a quarter of the bytes.
+# Figures have few colours; a palette takes half of the bytes.
 _COLOURS = 64
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A saved PNG; it is embedded in the page."""
-
-    caption: str
-    png: str | os.PathLike
-
-
-@dataclass(frozen=True)
 class Part:
-    """A ``heading``, ``code``, or ``links``: addresses relative to the page by label."""
+    """A piece of a page that is neither text nor a table; see the functions that make one.
+
+    ``kind``: ``heading``, ``code``, ``links`` (addresses relative to the page by label),
+    ``picture`` (a saved PNG), ``beside`` or ``folded`` (items).
+    """
 
     kind: str
     content: Any
+    title: str = ""
 
 
-@dataclass(frozen=True)
-class Beside:
-    """Items next to each other where the window is wide enough."""
-
-    items: Sequence[Item | None]
-
-
-@dataclass(frozen=True)
-class Folded:
-    """What opens on a click."""
-
-    title: str
-    items: Sequence[Item | None]
-
-
-Item = str | list | dict | Table | Picture | Part | Beside | Folded
-"""A string is a paragraph, a list are its points, and a dictionary explains its keys."""
+Item = str | list | dict | Table | Part | None
+"""A string is a paragraph, a list are its points, a dictionary explains its keys; None is left
+out."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +50,35 @@ class PageSection:
 
     name: str
     title: str
-    items: Sequence[Item | None]
+    items: Sequence[Item]
     short: str = ""
+
+
+def picture(caption: str, png: str | os.PathLike) -> Part:
+    """A saved PNG; it is embedded in the page."""
+    return Part("picture", png, caption)
+
+
+def beside(*items: Item) -> Part:
+    """Items next to each other where the window is wide enough."""
+    return Part("beside", items)
+
+
+def folded(title: str, *items: Item) -> Part:
+    """What opens on a click."""
+    return Part("folded", items, title)
+
+
+def as_yaml(config: Mapping[str, Any]) -> Part:
+    """A configuration as it is shown."""
+    return Part("code", yaml.safe_dump(dict(config), sort_keys=False))
+
+
+def grid(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table | None:
+    """A table for a page alone, without a title; None without rows."""
+    cells = [[names.short(value) for value in row] for row in rows]
+    columns = {("", name): [row[i] for row in cells] for i, name in enumerate(header)}
+    return Table("", "", "", **laid_out(columns), data=pd.DataFrame()) if cells else None
 
 
 def write_page(
@@ -77,7 +87,7 @@ def write_page(
     intro: Sequence[str],
     banners: Sequence[Mapping[str, Any]],
     sections: Sequence[PageSection],
-) -> Path:
+) -> None:
     """Write a page; all text is escaped.
 
     Args:
@@ -97,68 +107,63 @@ def write_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    shown = [vars(section) | {"parts": _all_shown(section.items)} for section in sections]
+    shown = [vars(section) | {"parts": _shown(section.items)} for section in sections]
     page = environment.get_template("report.html").render(
         title=title, intro=intro, banners=banners, sections=[x for x in shown if x["parts"]]
     )
     write_text(path, page)
-    return Path(path)
 
 
 def banners(metrics: pd.DataFrame, *, published: bool) -> list[dict[str, Any]]:
-    """Where the data of each dataset come from; ``published``: if the page shows the paper's."""
+    """Where data come from; ``published``: whether the page shows the paper's numbers."""
     # Unseen objects are of the same making as the known ones.
-    first = metrics.assign(dataset=metrics["dataset"].map(trained_on)).drop_duplicates("dataset")
+    origins = metrics.groupby(metrics["dataset"].map(trained_on), sort=False)["origin"].first()
+    kinds: dict[tuple[str, bool], list[str]] = {}
+    for dataset, origin in origins.items():
+        kind = (origin, dataset in names.DATASETS)
+        kinds.setdefault(kind, []).append(names.display_name(dataset))
     return [
         {
-            "name": names.display_name(dataset),
+            "names": names.join(datasets),
             "origin": origin,
             "description": names.ORIGINS[origin],
-            "in_paper": dataset in names.DATASETS,
+            "in_paper": in_paper,
             "published": published,
         }
-        for dataset, origin in zip(first["dataset"], first["origin"], strict=True)
+        for (origin, in_paper), datasets in kinds.items()
     ]
 
 
-def grid(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table | None:
-    """A table for a page alone, without a title; None without rows."""
-    cells = tuple(tuple(Cell(names.short(value)) for value in row) for row in rows)
-    columns = tuple(("", name) for name in header)
-    return Table("", "", "", columns, cells, pd.DataFrame()) if cells else None
+def _shown(items: Sequence[Item]) -> list[dict[str, Any]]:
+    """What the macro ``item`` of the template needs, by item."""
+    found = []
+    for item in items:
+        if not isinstance(item, Part):
+            if item is not None and item != []:
+                found.append({"kind": type(item).__name__.lower(), "content": item})
+        elif item.kind == "folded":
+            found.append({"kind": "folded", "title": item.title, "parts": _shown(item.content)})
+        elif item.kind == "beside":
+            # Tables one above the other, and pictures.
+            runs = itertools.groupby(_shown(item.content), lambda x: x["kind"] == "picture")
+            parts = [(drawn, list(some)) for drawn, some in runs]
+            found.append({"kind": "beside", "parts": parts})
+        elif item.kind == "picture":
+            found.append({"kind": "picture", "caption": item.title, **_embedded(item.content)})
+        else:
+            _check_links(item)
+            found.append(vars(item))
+    return found
 
 
-def as_yaml(config: Mapping[str, Any]) -> Part:
-    """The configuration as it is shown."""
-    return Part("code", yaml.safe_dump(dict(config), sort_keys=False))
-
-
-def _all_shown(items: Sequence[Item | None]) -> list[dict[str, Any]]:
-    return [_shown(item) for item in items if item is not None and item != []]
-
-
-def _shown(item: Item) -> dict[str, Any]:
-    """What the macro ``item`` of the template needs."""
-    kind = type(item).__name__.lower()
-    if isinstance(item, Beside | Folded):
-        title = getattr(item, "title", "")
-        return {"kind": kind, "title": title, "parts": _all_shown(item.items)}
-    if isinstance(item, Picture):
-        return {"kind": kind, "caption": item.caption, **_embedded(Path(item.png))}
-    if isinstance(item, Part):
-        return _checked(item)
-    return {"kind": kind, "content": item}
-
-
-def _checked(part: Part) -> dict[str, Any]:
+def _check_links(part: Part) -> None:
     for label, address in part.content.items() if part.kind == "links" else ():
         if "://" in address or address.startswith("/"):
             raise DataError(f"The report can link {label} only by a relative path, not {address}.")
-    return vars(part)
 
 
-def _embedded(png: Path) -> dict[str, Any]:
-    """The picture in base64, in few colours, and its width in CSS pixels."""
+def _embedded(png: str | os.PathLike) -> dict[str, Any]:
+    """A picture in base64, in few colours, and its width in CSS pixels."""
     try:
         with Image.open(png, formats=["PNG"]) as image:
             small = image.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
@@ -167,6 +172,6 @@ def _embedded(png: Path) -> dict[str, Any]:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DataError(f"The figure {png} is not a PNG image; draw it again.") from error
     stream = io.BytesIO()
-    small.save(stream, "PNG", optimize=True)
+    small.convert("RGB").save(stream, "WEBP", lossless=True)
     width = round(small.width * _PIXELS_PER_DOT)
     return {"image": base64.b64encode(stream.getvalue()).decode(), "width": width}

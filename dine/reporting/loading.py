@@ -1,20 +1,23 @@
-"""Reads ``metrics.csv`` files, for every table, figure and page."""
+"""The one loader of evaluation results: ``metrics.csv`` files to one tidy table."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from dine.errors import DataError
-from dine.evaluation.statistics import rounded
+from dine.evaluation.statistics import SUMMARISED, rounded
 from dine.reporting import names
 from dine.results import UNSEEN, unseen_of
 
-NUMBERS = ("seed", "level", "corruption", "cd", "cd_observed", "cd_unregistered", "mce")
+_NUMBERS = [
+    *("seed", "level", "corruption", "cd_observed", "cd_unregistered", "roughness_true"),
+    *SUMMARISED,
+]
 
 _TEXT = ("dataset", "backbone", "method", "origin", "pair", "object", "objects", "cluster")
 _ALLOWED = {
@@ -28,32 +31,19 @@ _MAY_LACK = {"level", "seconds", "mce", "accuracy_2_5", "accuracy_5", "far_point
 
 
 def load_metrics(paths: Iterable[str | os.PathLike]) -> pd.DataFrame:
-    """``read_metrics``; unseen objects are a dataset of their own where others are known.
+    """Read ``metrics.csv`` of any datasets, backbones, methods and seeds into one frame.
 
     A dataset whose test pairs are both of objects that were trained on and of others is shown as
     two: under its own name the known objects, and with ``_unseen`` behind it the others.
-    """
-    metrics = read_metrics(paths)
-    kinds = metrics.groupby("dataset")["objects"].transform("nunique")
-    apart = (kinds > 1) & (metrics["objects"] == UNSEEN)
-    return metrics.assign(dataset=metrics["dataset"].mask(apart, metrics["dataset"].map(unseen_of)))
-
-
-def read_metrics(
-    paths: Iterable[str | os.PathLike], numbers: Sequence[str] = NUMBERS
-) -> pd.DataFrame:
-    """Read metrics files of any datasets, backbones, methods and seeds into one frame.
 
     Args:
-        paths: files of ``dine evaluate``.
-        numbers: the columns to read besides names; distances in the normalised frame, squared for
-            ``cd`` and its like. Some may be empty: see ``docs/metrics.md``.
+        paths: files of ``dine evaluate``. Columns: see ``docs/reference/metrics.md``.
 
     Raises:
         DataError: a file is missing, lacks a column or holds values that cannot be used, the same
             evaluation stands in two rows, or a dataset mixes origins.
     """
-    frames = [_read_one(Path(path), list(numbers)) for path in paths]
+    frames = [_read_one(Path(path)) for path in paths]
     if not frames:
         raise DataError("No metrics files were given; evaluate a model first.")
     metrics = pd.concat(frames, ignore_index=True)
@@ -67,10 +57,12 @@ def read_metrics(
                 f"The metrics files of {dataset} mix data of different origins "
                 f"({', '.join(sorted(origins))}); their numbers cannot stand in one table."
             )
-    return metrics
+    kinds = metrics.groupby("dataset")["objects"].transform("nunique")
+    apart = (kinds > 1) & (metrics["objects"] == UNSEEN)
+    return metrics.assign(dataset=metrics["dataset"].mask(apart, metrics["dataset"].map(unseen_of)))
 
 
-def _read_one(path: Path, numbers: list[str]) -> pd.DataFrame:
+def _read_one(path: Path) -> pd.DataFrame:
     try:
         # As text first: a pair may be called "NA" or "007".
         frame = pd.read_csv(path, dtype=str, keep_default_na=False)
@@ -78,7 +70,7 @@ def _read_one(path: Path, numbers: list[str]) -> pd.DataFrame:
         raise DataError(f"{path} does not exist.") from error
     except (OSError, ValueError) as error:
         raise DataError(f"{path} is not a readable CSV file ({error}).") from error
-    columns = [*_TEXT, "condition", *numbers]
+    columns = [*_TEXT, "condition", *_NUMBERS]
     missing = [name for name in columns if name not in frame]
     if missing:
         raise DataError(f"{path} lacks the column(s) {', '.join(missing)}; evaluate again.")
@@ -94,7 +86,7 @@ def _read_one(path: Path, numbers: list[str]) -> pd.DataFrame:
             raise DataError(
                 f"{path}: unknown {name} {unknown.iloc[0]!r}; expected one of {', '.join(allowed)}."
             )
-    read = {name: _read_numbers(frame[name], path) for name in numbers}
+    read = {name: _read_numbers(frame[name], path) for name in _NUMBERS}
     return rounded(frame.assign(**read)).astype({"seed": int})
 
 

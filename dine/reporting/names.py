@@ -80,6 +80,7 @@ def in_order(frame: pd.DataFrame, keys: list[str]) -> pd.DataFrame:
     """Rows sorted by some columns, names as the paper has them."""
     orders = {
         "condition": CONDITIONS,
+        "measure": [*CONDITIONS, "mce"],
         "backbone": ["", *BACKBONES],
         "method": METHODS,
         "objects": [KNOWN],

@@ -12,7 +12,8 @@ from dine.errors import DataError
 from dine.files import write_json
 from dine.priors.base import load_prior
 from dine.priors.diagnostics import diagnose
-from dine.reporting.figures import prior_samples_figure, save_figure
+from dine.reporting.figures import save_figure
+from dine.reporting.views import prior_samples_figure
 
 _SAMPLES = 4
 

@@ -1,4 +1,4 @@
-"""The report of a finished run, from the files in its results folder."""
+"""The report of a finished run: its sections, from the files in its folder."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ import pandas as pd
 from dine.config import STAGE1, Config
 from dine.files import read_json
 from dine.provenance import versions
-from dine.reporting.build import Run
-from dine.reporting.effects import effects, headlines, overview
 from dine.reporting.html import (
-    Beside,
     Item,
     PageSection,
     Part,
-    Picture,
     as_yaml,
     banners,
+    beside,
+    folded,
     grid,
+    picture,
     write_page,
 )
-from dine.reporting.names import CD_SCALE, display_name
-from dine.reporting.tables import all_tables
-from dine.results import CLEAN, runs, table_name
+from dine.reporting.names import CD_SCALE, display_name, slug
+from dine.reporting.run import LAMBDA_TITLE, Run
+from dine.reporting.tables import all_tables, findings
+from dine.results import (
+    CLEAN,
+    runs,
+    table_name,
+)
 
 INTRO = (
     "Registering two point clouds of soft tissue means finding a displacement for every point of "
@@ -40,6 +44,7 @@ INTRO = (
     "Errors are squared symmetric Chamfer distances (CD) between the registered source and the "
     "clean target in units of 10⁻⁴ of the normalised frame; lower is better.",
 )
+_NO_PRIOR = "No prior was evaluated in this run, so there is nothing to compare."
 _LAMBDA = (
     "λ weighs the prior against the distance term. It was chosen on validation pairs; test pairs "
     "played no part."
@@ -62,12 +67,11 @@ def build_report(results: Path, config: Config, out: Path) -> None:
         {"dataset": display_name(dataset)} | read_json(run.files.data(dataset).agreement)
         for dataset in config.datasets
     ]
-    pictures: dict[str, list[tuple[str, Picture]]] = {}
-    for name, (section, caption, _) in run.all_figures().items():
-        png = run.files.figure(name, "png")
-        pictures.setdefault(section, []).append((name, Picture(caption, png)))
+    pictures: dict[str, dict[str, Part]] = {}
+    for name, (section, caption, _) in run.figures().items():
+        pictures.setdefault(section, {})[name] = picture(caption, run.files.figure(name, "png"))
     searches = [read_json(path) for path in run.searches().values()]
-    chosen = [picture for _, picture in pictures.pop("Choice of λ", [])]
+    chosen = list(pictures.pop(LAMBDA_TITLE, {}).values())
     sections = [
         *result_sections(run.metrics, pictures, config.evaluation.training_spread),
         lambda_section(searches, chosen),
@@ -79,34 +83,39 @@ def build_report(results: Path, config: Config, out: Path) -> None:
 
 def result_sections(
     metrics: pd.DataFrame,
-    pictures: Mapping[str, Sequence[tuple[str, Picture]]] | None = None,
+    pictures: Mapping[str, Mapping[str, Part]] | None = None,
     spread: float = 0.0,
 ) -> list[PageSection]:
     """Findings, tables and figures; a figure whose numbers a table holds stands beside it.
 
     Args:
         metrics: as ``load_metrics`` returns them.
-        pictures: names and pictures by heading, in reading order.
-        spread: how much differences vary with the training; see ``statistics.verdicts``.
+        pictures: by heading and name, in reading order.
+        spread: how much differences vary with the training; see ``statistics.comparisons``.
     """
-    beside: dict[str, list[Picture]] = {}
-    figures: list[Item] = []
+    at_tables: dict[str, list[Part]] = {}
+    figures = []
     for heading, some in (pictures or {}).items():
-        apart = []
-        for name, picture in some:
-            table = _table_of(name)
-            if table:
-                beside.setdefault(table, []).append(picture)
-            else:
-                apart.append(picture)
-        figures += [Part("heading", heading), *apart] if apart else []
-    tables = [Beside([table, *beside.get(table.name, [])]) for table in all_tables(metrics, spread)]
-    control = effects(metrics, spread=spread)
-    findings = [headlines(control, metrics), overview(control, metrics, spread=spread)]
+        apart: dict[str, list[Part]] = {}
+        for name, shown in some.items():
+            table, (_, _, of) = _table_of(name), name.partition("_")
+            (at_tables if table else apart).setdefault(table or of, []).append(shown)
+        # Figures of one thing are beside each other; where each thing has one, all of them are.
+        rows = list(apart.values())
+        if all(len(row) == 1 for row in rows):
+            rows = [[shown for row in rows for shown in row]] if rows else []
+        shown_rows = [beside(*row) for row in rows]
+        figures.append(PageSection(slug(heading).lower(), heading, shown_rows))
+    tables = {
+        table.name: beside(table, *at_tables.get(table.name, []))
+        for table in all_tables(metrics, spread)
+    }
+    gains = [tables.pop(name) for name in list(tables) if name.startswith("gains")]
     return [
-        PageSection("findings", "Findings", findings),
-        PageSection("tables", "Tables", tables),
-        PageSection("figures", "Figures", figures),
+        PageSection("findings", "Findings", findings(metrics, spread=spread) or [_NO_PRIOR]),
+        PageSection("tables", "Tables", list(tables.values())),
+        PageSection("gains", "What a prior adds", gains),
+        *figures,
     ]
 
 
@@ -118,7 +127,7 @@ def _table_of(figure: str) -> str | None:
 
 
 def lambda_section(
-    searches: Sequence[Mapping[str, Any]], pictures: Sequence[Picture] = ()
+    searches: Sequence[Mapping[str, Any]], pictures: Sequence[Part] = ()
 ) -> PageSection:
     """Per prior: the choice, its validation errors and those of the λ = 0 control."""
     rows = []
@@ -133,8 +142,8 @@ def lambda_section(
             rows.append([search["dataset"], search["backbone"], prior, *cells])
     header = ["Dataset", "Backbone", "Prior", "Chosen λ", "CD ×10⁻⁴", "Correspondence error"]
     header += ["CD ×10⁻⁴ at λ = 0", "Correspondence error at λ = 0"]
-    items = [_LAMBDA, grid(header, rows), *pictures] if rows else []
-    return PageSection("lambda", "Choice of λ", items)
+    items = [_LAMBDA, beside(grid(header, rows), *pictures)] if rows else []
+    return PageSection("lambda", LAMBDA_TITLE, items)
 
 
 def agreement_section(agreement: Sequence[Mapping[str, Any]]) -> PageSection:
@@ -145,7 +154,7 @@ def agreement_section(agreement: Sequence[Mapping[str, Any]]) -> PageSection:
     return PageSection("indices", title, [_INDICES, table], short="Point indices")
 
 
-def _made(run: Run, config: Config) -> list[Item | None]:
+def _made(run: Run, config: Config) -> list[Item]:
     seconds, made = {}, {}
     for dataset, backbone, method in runs(config):
         record = read_json(run.files.run(dataset, backbone, method).record)
@@ -164,8 +173,7 @@ def _made(run: Run, config: Config) -> list[Item | None]:
         grid(["Step", "Time"], seconds.items()),
         Part("heading", "Versions"),
         grid(["Package", "Version"], versions().items()),
-        Part("heading", "Configuration"),
-        as_yaml(config.model_dump(mode="json")),
+        folded("Configuration", as_yaml(config.model_dump(mode="json"))),
         Part("heading", "Files"),
         Part("links", links),
     ]

@@ -16,10 +16,17 @@ from dine.files import atomic_path, write_text
 
 @dataclass(frozen=True)
 class Cell:
-    """One entry of a displayed table, as plain text."""
+    """One entry of a displayed table, as plain text; pages colour what is lower or higher."""
 
     text: str
     bold: bool = False
+    verdict: str = ""
+
+    @property
+    def lines(self) -> tuple[str, str]:
+        """A number and, beneath it on pages, its deviation or interval."""
+        first, *rest = re.split(r" (?=[±(\[])", self.text, maxsplit=1)
+        return first, "".join(rest)
 
 
 Columns = dict[tuple[str, str], Iterable[Any]]
@@ -52,6 +59,22 @@ class Table:
                 found[-1] = (group, found[-1][1] + 1)
             else:
                 found.append((group, 1))
+        return found
+
+    @property
+    def labels(self) -> int:
+        """Number of columns on the left that say what a row is of."""
+        named = [i for i, (group, _) in enumerate(self.header) if group]
+        return named[0] if named else 1
+
+    def once(self) -> list[tuple[Cell, ...]]:
+        """The rows, with labels that repeat those of the row above left blank, but the last one."""
+        found = []
+        for above, row in zip((None, *self.rows), self.rows, strict=False):
+            same = 0
+            while above and same < self.labels - 1 and above[same] == row[same]:
+                same += 1
+            found.append((Cell(""),) * same + row[same:])
         return found
 
 

@@ -15,15 +15,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from dine.evaluation.statistics import rounded, verdicts
+from dine.config import CONTROL, STAGE1
+from dine.evaluation import statistics
+from dine.evaluation.statistics import comparisons, rounded
 from dine.reporting import names
+from dine.reporting.comparisons import effects, training_chance, verdict_cells
 from dine.reporting.loading import origin_of
 from dine.reporting.names import CD_SCALE, DASH, display_name, in_order, mean_and_deviation, rank
 from dine.reporting.table import Cell, Columns, Table, laid_out
 from dine.results import CLEAN, PAPER_TABLES, table_name, trained_on
 
 CORRUPTIONS = ("outliers", "noise", "resampled")
-BASELINES = ("stage1", "lambda0")
+BASELINES = (STAGE1, CONTROL)
 
 _SETTING = ["condition", "corruption", "level"]
 _SERIES = ["backbone", "method"]
@@ -105,24 +108,21 @@ def published() -> pd.DataFrame:
 def summary(
     metrics: pd.DataFrame, value: str = "cd", scale: float = CD_SCALE, pool_levels: bool = False
 ) -> pd.DataFrame:
-    """Mean and sample standard deviation of ``scale`` times a metric over pairs.
+    """``mean`` and ``std`` of ``scale`` times a metric over ``n`` pairs, averaged over seeds.
 
-    One row per dataset, condition, corruption, level, backbone and method, with the number ``n``
-    of pairs. The standard deviation of a single pair is missing, not zero. With ``pool_levels``
-    all deformation levels count together and ``level`` is missing.
+    The standard deviation of a single pair is missing, not zero. With ``pool_levels`` all
+    deformation levels count together and ``level`` is missing.
     """
-    frame = rounded(metrics)
-    frame[value] = scale * frame[value]
-    if pool_levels:
-        frame["level"] = np.nan
-    grouped = frame.groupby(["dataset", *_SETTING, *_SERIES], dropna=False)[value]
-    return grouped.agg(n="count", mean="mean", std="std").reset_index()
+    scaled = metrics.assign(**{value: scale * metrics[value]})
+    found = statistics.summary(scaled, (value,), pool_levels=pool_levels)
+    named = {"pairs": "n", f"{value}_mean": "mean", f"{value}_sd": "std"}
+    return found.rename(columns=named)[["dataset", *_SETTING, *_SERIES, *named.values()]]
 
 
 def _decided(metrics: pd.DataFrame, value: str, spread: float) -> pd.DataFrame:
-    """``verdicts`` against the control: by level on clean targets, pooled on others."""
+    """``comparisons`` with the control: by level on clean targets, pooled on others."""
     levels = metrics["level"].where(metrics["condition"] == CLEAN)
-    found = verdicts(metrics.assign(level=levels), "lambda0", value, spread=spread)
+    found = comparisons(metrics.assign(level=levels), CONTROL, (value,), spread=spread)
     return found[found["level"].notna() == (found["condition"] == CLEAN)]
 
 
@@ -131,7 +131,7 @@ def _compare(
 ) -> pd.DataFrame:
     """Tidy numbers of one dataset: ours and, where ``reference`` has them, the published ones.
 
-    With what each method differs by from the control, as ``statistics.verdicts`` says it.
+    With what each method differs by from the control, as ``statistics.comparisons`` says it.
     """
     rows = metrics[(metrics["dataset"] == dataset) & metrics["condition"].isin(kind.conditions)]
     rows = rows[rows[kind.value].notna()]
@@ -164,8 +164,8 @@ def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
     One row per dataset, backbone, prior and setting (deformation by level, corruptions pooled over
     levels). ``gain_over_lambda0`` is the effect of the prior, ``lambda0_gain_over_stage1`` that of
     the longer training alone; negative values are losses. ``low`` and ``high`` are its 95 %
-    interval and ``verdict`` what follows, as of ``statistics.verdicts``. Only pairs evaluated with
-    every method present count; columns of a method that was not run are missing.
+    interval and ``verdict`` what follows, as of ``statistics.comparisons``. Only pairs evaluated
+    with every method present count; columns of a method that was not run are missing.
     """
     frame = rounded(metrics)
     frame["cd"] = CD_SCALE * frame["cd"]
@@ -213,7 +213,78 @@ def _gain(before: float, after: float) -> float:
     return 100 * (1 - after / before) if before > 0 else np.nan
 
 
-# --------------------------------------------------------------------------------- tables
+# ------------------------------------------------------------------------------- findings
+
+
+def findings(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[Table]:
+    """Verdicts on clean targets, then those under other conditions and by other measures.
+
+    Empty where no prior was evaluated beside the control.
+    """
+    control = effects(metrics, spread=spread)
+    errors = effects(metrics, value="mce", spread=spread)
+    first = effects(metrics, STAGE1, spread=spread)
+    clean = control[control["condition"] == CLEAN]
+    others = [
+        control[control["condition"] != CLEAN].assign(measure=lambda x: x["condition"]),
+        errors[errors["condition"] == CLEAN].assign(measure="mce"),
+        first[first["condition"] == CLEAN].assign(measure=STAGE1),
+    ]
+    caption = _CAPTION + (training_chance(spread) if spread else "")
+    made = [
+        ("Does a prior lower the Chamfer distance on clean targets?", caption, clean),
+        (
+            "Under other conditions, and by other measures",
+            "",
+            in_order(pd.concat(others), ["measure", "objects", "method"]),
+        ),
+    ]
+    return [
+        Table("", title, text, **laid_out(_by_place(data)), data=data)
+        for title, text, data in made
+        if len(data)
+    ]
+
+
+_MEASURES = {
+    **{key: f"Chamfer distance, {text.lower()}" for key, text in names.CONDITIONS.items()},
+    "mce": "Mean correspondence error",
+    STAGE1: "Chamfer distance, against Stage 1",
+}
+
+
+def _by_place(data: pd.DataFrame) -> Columns:
+    """A row for each kind of objects and prior, or ``measure`` of these; a column for each place.
+
+    A place is a dataset with a backbone, whether the objects are known or not.
+    """
+    data = data.assign(dataset=data["dataset"].map(trained_on))
+    keys = ["measure", "objects", "method"] if "measure" in data else ["objects", "method"]
+    rows = list(data[keys].drop_duplicates().itertuples(index=False, name=None))
+    columns: Columns = {}
+    if len(keys) > 2:
+        columns["", "Measure"] = [_MEASURES[row[0]] for row in rows]
+    columns["", "Objects"] = [names.OBJECTS[row[-2]].capitalize() for row in rows]
+    columns["", "Prior"] = [display_name(row[-1]) for row in rows]
+    for place, here in in_order(data, ["dataset", "backbone"]).groupby(
+        ["dataset", "backbone"], sort=False
+    ):
+        columns[tuple(map(display_name, place))] = verdict_cells(here, keys, rows)
+    return columns
+
+
+_CAPTION = (
+    "Lower, higher or undecided: the mean of the prior against that of the control, which was "
+    "trained alike but with λ = 0. Beside it the difference in percent of the control's mean, over "
+    "all levels and strengths, and its 95 % interval. Where that holds zero, the matter is "
+    "undecided. The interval is of the test pairs that both methods share: drawn by deformation "
+    "where the object is known, and by object where it is unseen. "
+    "Known objects are those that were trained on, under deformations that were not; the prior is "
+    "defined for these. Unseen objects were not trained on at all."
+)
+
+
+# -------------------------------------------------------------------------------- tables
 
 
 def mean_table(kind: str, dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
@@ -278,7 +349,7 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
         DASH if np.isnan(row["low"]) else f"{names.interval(row['low'], row['high'])} %"
         for row in rows
     ]
-    columns["", "Verdict"] = data["verdict"].fillna(DASH)
+    columns["", "Verdict"] = [Cell(x or DASH, verdict=x) for x in data["verdict"].fillna("")]
     better = data["pairs_better_than_lambda0"]
     columns["", "Pairs better than control"] = [
         DASH if np.isnan(value) else f"{value:.0f} %" for value in better
@@ -306,7 +377,7 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
 def all_tables(metrics: pd.DataFrame, spread: float = 0.0) -> list[Table]:
     """Every table that the metrics have rows for: the paper's first, then the supplementary.
 
-    ``spread`` is how much differences vary with the training; see ``statistics.verdicts``.
+    ``spread`` is how much differences vary with the training; see ``statistics.comparisons``.
     """
     tables, comparisons, supplementary = [], [], []
     for dataset in sorted(metrics["dataset"].unique(), key=lambda name: rank(name, names.DATASETS)):

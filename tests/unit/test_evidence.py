@@ -11,17 +11,12 @@ from test_html import Page
 
 from dine.errors import DataError
 from dine.evaluation import statistics
-from dine.reporting.evidence import (
-    EvidenceStatistics,
-    ExamplePicture,
-    Files,
-    build_evidence,
-    figures,
-    load_evidence,
-    tables,
-)
-from dine.reporting.evidence.comparisons import at
+from dine.reporting import evidence_tables as tables
+from dine.reporting import figures
+from dine.reporting.comparisons import EvidenceStatistics, at
+from dine.reporting.evidence import ExamplePicture, Files, build_evidence
 from dine.reporting.figures import save_figure
+from dine.reporting.loading import load_metrics
 
 pytestmark = pytest.mark.numerical
 DATASETS = ("deformedtissue", "synbench")
@@ -84,6 +79,7 @@ def made_up(effects=None, *, datasets=DATASETS, backbones=BACKBONES, seeds=3, co
                                         "cluster": [f"{i:03d}" for i in range(OBJECTS)],
                                         **{"level": level, "condition": condition},
                                         **{"corruption": corruption, "cd": mce**2, "mce": mce},
+                                        **{"cd_observed": mce**2, "cd_unregistered": 0.01},
                                         **{"hd95": 2 * mce, "accuracy_2_5": 0.5},
                                         **{"accuracy_5": 0.75, "far_points": 0.25},
                                         **{"folding": 0.01 * factor, "roughness": 0.3 * factor},
@@ -159,7 +155,7 @@ def test_strings_stay_strings_and_floats_meet(tmp_path):
     metrics = made_up({"lambda0": 1.0}, datasets=("d",), seeds=1, corrupted=False)
     metrics["pair"] = ["NA", *(f"{i:05d}" for i in range(1, len(metrics)))]
     metrics["level"] = metrics["level"].astype(np.float32).astype(float)
-    found = load_evidence(written(metrics, tmp_path))
+    found = load_metrics(written(metrics, tmp_path))
     assert set(found["pair"]) == set(metrics["pair"])
     assert set(found["level"]) == set(LEVELS)
     assert found["seconds"].isna().all()
@@ -183,22 +179,22 @@ def test_unusable_files_are_refused(tmp_path, change, message):
     metrics = made_up({"lambda0": 1.0}, datasets=("d",), backbones=("b",), seeds=1)
     change(metrics).to_csv(tmp_path / "m.csv", index=False)
     with pytest.raises(DataError, match=message):
-        load_evidence([tmp_path / "m.csv"])
+        load_metrics([tmp_path / "m.csv"])
 
 
 def test_files_that_contradict_each_other_are_refused(tmp_path):
     metrics = made_up({"lambda0": 1.0, "pca": 1.0}, datasets=("d",), backbones=("b",), seeds=1)
     paths = written(metrics, tmp_path)
     with pytest.raises(DataError, match=r"same evaluation twice .*dataset d, backbone b, method"):
-        load_evidence([*paths, paths[0]])
+        load_metrics([*paths, paths[0]])
     changed = metrics["method"] == "pca"
     written(metrics.assign(origin=np.where(changed, "doi", "synthetic")), tmp_path)
     with pytest.raises(DataError, match=r"different origins \(doi, synthetic\)"):
-        load_evidence(paths)
+        load_metrics(paths)
     with pytest.raises(DataError, match="does not exist"):
-        load_evidence([tmp_path / "none.csv"])
+        load_metrics([tmp_path / "none.csv"])
     with pytest.raises(DataError, match="No metrics files"):
-        load_evidence([])
+        load_metrics([])
 
 
 def test_reference_and_groups_are_checked(tmp_path):
@@ -222,7 +218,7 @@ def evidence(tmp_path_factory):
     # Targets were corrupted on one of the datasets only.
     metrics = metrics[(metrics["condition"] == "deformation") | (metrics["dataset"] == "synbench")]
     paths = written(metrics, tmp_path_factory.mktemp("metrics"))
-    return EvidenceStatistics(load_evidence(paths), METHODS)
+    return EvidenceStatistics(load_metrics(paths), METHODS)
 
 
 def test_verdicts_where_the_goal_is_reached(evidence):
@@ -254,6 +250,24 @@ def test_verdicts_where_the_goal_is_reached(evidence):
     below = [cells[name]["Below the best classical MCE"].text for name in ("MAP", "Smoothness")]
     assert below == ["16 of 16", "16 of 16"]
     assert cells["CPD"]["Below the best classical MCE"].text == "–"
+
+
+def test_findings_have_every_method_at_every_place(evidence):
+    table = tables.overview_table(evidence)
+    rows = shown(table)
+    assert list(rows) == [evidence.title(name) for name in evidence.rivals]
+    places = [
+        f"{d}, {b}"
+        for d in ("DeformedTissue", "SynBench")
+        for b in ("Robust-DefReg", "DefTransNet")
+    ]
+    values = ("Mean correspondence error", "Chamfer distance ×10⁻⁴")
+    assert table.header[2:] == tuple((value, place) for value in values for place in places)
+    for place, name in zip(evidence.places, places, strict=True):
+        whole = shown(tables.verdict_table(evidence, place))
+        for method, row in rows.items():
+            for value in values:
+                assert row[f"{value} {name}"] == whole[method][f"{value} Clean targets"]
 
 
 def test_what_the_numbers_rest_on(evidence):
@@ -551,14 +565,14 @@ def test_report_is_one_self_contained_page(report):
     assert len(page.images) == 2 + 1 + 1 + 1 + 1 + 1
     for image in page.images:
         assert "SynBench (synthetic data)" in image["alt"]
-    for title in ("short", "main", "answer", "corrupted", "plausibility", "seeds", "priors"):
+    for title in ("findings", "main", "answer", "corrupted", "plausibility", "seeds", "priors"):
         assert title in page.ids
     # A figure stands beside the table of its numbers.
     for name in ("effects", "levels"):
         assert (
             report / "figures" / f"{name}_synbench{'_deftransnet' * (name == 'effects')}.png"
         ).exists()
-    beside = [part.partition("</figure>")[0] for part in text.split('class="beside"')[1:]]
+    beside = [part.partition("</table>")[0] for part in text.split('class="beside"')[1:]]
     assert len(beside) == 3
     assert all("<table" in part and "<img" in part for part in beside)
     for part in (
@@ -607,7 +621,7 @@ def test_parts_without_data_are_left_out(tmp_path):
     assert {"main", "answer", "methods"} <= page.ids
     assert "synthetic" not in page.words
     assert "Configuration" not in page.words
-    assert "how much another training would differ" in page.words
+    assert "How much another training would differ" in page.words
 
 
 def test_files_of_unknown_datasets_are_refused(tmp_path):

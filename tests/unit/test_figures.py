@@ -7,7 +7,7 @@ import pytest
 from matplotlib.colors import to_hex
 
 from dine.errors import DataError
-from dine.reporting import figures
+from dine.reporting import figures, views
 
 METHODS = ("stage1", "lambda0", "pca")
 
@@ -24,6 +24,9 @@ def metrics():
             "origin": "synthetic",
             "pair": f"{level}-{pair}",
             "object": "made-up",
+            "cluster": "made-up",
+            "seed": 0,
+            "mce": 0.1,
             "level": level,
             "condition": condition,
             "corruption": corruption,
@@ -156,30 +159,30 @@ def stored(tmp_path):
 
 def test_examples_are_matched_by_pair_name(stored):
     pairs, predictions, errors, displacement, squared = stored
-    (example,) = figures.load_examples([("noise_0.04", "a", "Noise")], pairs, predictions, errors)
+    (example,) = views.load_examples([("noise_0.04", "a", "Noise")], pairs, predictions, errors)
     np.testing.assert_allclose(example.registered["pca"], pairs.source[0] + displacement[1])
     np.testing.assert_array_equal(example.errors["pca"], 1e4 * squared[1])
     np.testing.assert_array_equal(example.target, pairs.target[0])
     with pytest.raises(DataError, match="Pair c is not in the pairs"):
-        figures.load_examples([("noise_0.04", "c", "")], pairs, predictions, errors)
+        views.load_examples([("noise_0.04", "c", "")], pairs, predictions, errors)
 
 
 def test_reading_groups_names_what_is_missing(stored, tmp_path):
     path = stored[1]["pca"]
     with pytest.raises(DataError, match=r"pca_predictions\.h5 holds no outliers_25/displacement"):
-        figures.read_group(path, "outliers_25", "displacement")
+        views.read_group(path, "outliers_25", "displacement")
     with pytest.raises(DataError, match=r"none\.h5 does not exist"):
-        figures.read_group(tmp_path / "none.h5", "deformation", "displacement")
+        views.read_group(tmp_path / "none.h5", "deformation", "displacement")
     (tmp_path / "text.h5").write_text("no HDF5")
     with pytest.raises(DataError, match=r"text\.h5 is not a readable HDF5 file"):
-        figures.read_group(tmp_path / "text.h5", "deformation", "displacement")
+        views.read_group(tmp_path / "text.h5", "deformation", "displacement")
 
 
 def test_qualitative_figure(stored, tmp_path):
     pairs, predictions, errors, _, squared = stored
     picks = [("noise_0.04", "a", "Noise"), ("noise_0.04", "b", "More noise")]
-    examples = figures.load_examples(picks, pairs, predictions, errors)
-    figure = figures.qualitative_figure(examples, "Views", "synthetic")
+    examples = views.load_examples(picks, pairs, predictions, errors)
+    figure = views.qualitative_figure(examples, "Views", "synthetic")
     panels, bar = figure.axes[:-1], figure.axes[-1]
     assert [axes.get_title() for axes in panels[:4]] == [
         *("Before", "Stage 1", "Control (λ = 0)", "DINE-PCA")
@@ -202,7 +205,7 @@ def test_qualitative_figure(stored, tmp_path):
 
 
 def test_picked_examples_are_the_median_hard_cases(metrics):
-    picks = figures.pick_examples("deformedtissue", "deftransnet", metrics)
+    picks = views.pick_examples("deformedtissue", "deftransnet", metrics)
     assert [key for key, _, _ in picks] == ["deformation", "noise_0.04"]
     assert picks[1][2] == "Noise σ = 0.04\nlevel 0.9"
     rows = metrics[
@@ -215,9 +218,9 @@ def test_picked_examples_are_the_median_hard_cases(metrics):
 
 
 def test_condition_keys():
-    assert figures.condition_key("deformation", 0) == "deformation"
-    assert figures.condition_key("noise", 0.03) == "noise_0.03"
-    assert figures.condition_key("outliers", 25.0) == "outliers_25"
+    assert views.condition_key("deformation", 0) == "deformation"
+    assert views.condition_key("noise", 0.03) == "noise_0.03"
+    assert views.condition_key("outliers", 25.0) == "outliers_25"
 
 
 # -------------------------------------------------------------------- training and priors
@@ -281,6 +284,9 @@ def test_training_figure_draws_what_there_is():
     assert titles == ["Training loss", "Prior penalty", "validation_cd"]
     assert list(lines(shown[2])["DINE-PCA"].get_xdata()) == [0, 5]
     assert [axes.get_yscale() for axes in shown] == ["log", "linear", "log"]
+    known = {"pca": pd.DataFrame({"step": [0, 1], "val_cd": [1.0, 2.0]})}
+    once = figures.training_figure(known, "", "synthetic").axes
+    assert [axes.get_title() for axes in once] == ["Validation Chamfer distance"]
     with pytest.raises(DataError, match="no values to plot"):
         figures.training_figure({"pca": pd.DataFrame({"step": step})}, "", "synthetic")
 
@@ -298,7 +304,7 @@ def test_pca_modes_are_drawn_at_two_standard_deviations(tmp_path):
     rng = np.random.default_rng(2)
     source = rng.normal(size=(30, 3))
     modes = rng.normal(size=(2, 30, 3))
-    figure = figures.pca_modes_figure(
+    figure = views.pca_modes_figure(
         np.full((30, 3), 0.1), modes, np.array([4.0, 0.25]), source, "Modes", "synthetic"
     )
     panels = figure.axes[:-1]

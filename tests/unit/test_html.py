@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageChops, ImageStat
 
 from dine.errors import DataError
-from dine.reporting import figures, html, report
-from dine.reporting.effects import effects, headlines, overview
+from dine.reporting import figures, html, report, table
+from dine.reporting.comparisons import effects
+from dine.reporting.tables import findings
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
@@ -87,8 +88,8 @@ def page(tmp_path, metrics, pictures=None, more=(), *, spread=0.0):
     """The text of a report: of results, and whatever sections more."""
     sections = [*report.result_sections(metrics, pictures, spread), *more]
     banners = html.banners(metrics, published=True)
-    path = html.write_page(tmp_path / "report.html", "A run", report.INTRO, banners, sections)
-    return path.read_text(encoding="utf-8")
+    html.write_page(tmp_path / "report.html", "A run", report.INTRO, banners, sections)
+    return (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def full_page(tmp_path, figure, metrics):
@@ -103,10 +104,8 @@ def full_page(tmp_path, figure, metrics):
     }
     config = {"data": {"origin": "synthetic"}, "note": "<script>alert(1)</script>"}
     pictures = {
-        "Level <figures>": [("training_x", html.Picture("A line & more", figure))],
-        "Accuracy": [
-            ("distance_deformedtissue_deformation", html.Picture("Beside Table 1", figure))
-        ],
+        "Level <figures>": {"training_x": html.picture("A line & more", figure)},
+        "Accuracy": {"distance_deformedtissue_deformation": html.picture("Beside Table 1", figure)},
     }
     more = [
         report.lambda_section([search]),
@@ -127,13 +126,14 @@ def full_page(tmp_path, figure, metrics):
 def test_report_is_one_self_contained_page(tmp_path, figure):
     text = full_page(tmp_path, figure, made_up(0.25))
     found = Page(text)
+    assert len(text) < 100_000
     assert "script" not in re.findall(r"<(\w+)", text)
     assert not re.search(r"url\(|@import|<link", text)
     for address in found.addresses:
         if address.startswith("#"):
             assert address[1:] in found.ids
         else:
-            assert address.startswith("data:image/png;base64,") or address == "tables/table1.csv"
+            assert address.startswith("data:image/webp;base64,") or address == "tables/table1.csv"
     beside, image = found.images
     # In fewer colours, which nobody sees.
     stream = io.BytesIO(base64.b64decode(image["src"].partition(",")[2]))
@@ -146,6 +146,49 @@ def test_report_is_one_self_contained_page(tmp_path, figure):
     # Next to the table that holds its numbers.
     next_to = text.partition('id="table1"')[2].partition("<h3")[0]
     assert "Beside Table 1" in next_to
+
+
+def test_figures_of_one_thing_stand_beside_each_other(tmp_path, figure):
+    def rows(*names):
+        drawn = {name: html.picture(name, figure) for name in names}
+        sections = report.result_sections(made_up(0.25), {"Priors": drawn})
+        (section,) = [section for section in sections if section.title == "Priors"]
+        assert section.name == "priors"
+        return [[shown.title for shown in row.content] for row in section.items]
+
+    assert rows("spectrum_a", "modes_a", "spectrum_b", "modes_b") == [
+        ["spectrum_a", "modes_a"],
+        ["spectrum_b", "modes_b"],
+    ]
+    assert rows("histogram_a", "histogram_b") == [["histogram_a", "histogram_b"]]
+
+
+def test_contents_lead_to_every_section_and_stay_in_view(tmp_path, figure):
+    text = full_page(tmp_path, figure, made_up(0.25))
+    contents = re.findall(r'<a href="#([^"]+)">([^<]+)', text.partition("<nav")[2])
+    assert [name for name, _ in contents] == re.findall(r'<h2 id="([^"]+)"', text)
+    assert [label for _, label in contents][:3] == ["Findings", "Tables", "What a prior adds"]
+    styles = text.partition("<style>")[2].partition("</style>")[0]
+    wide, _, narrow = styles.partition("@media screen and (max-width: 60rem)")
+    assert re.search(r"nav \{[^}]*position: sticky;", wide)
+    assert re.search(r"nav \{[^}]*top: 0; flex-flow: row wrap;", narrow)
+
+
+def test_labels_are_said_once_and_deviations_stand_beneath():
+    made = table.Table(
+        *("x", "", ""),
+        header=(("", "Kind"), ("", "Method"), ("CD", "Mean")),
+        rows=tuple(
+            (table.Cell("Prior"), table.Cell(name), table.Cell("1.00 ± 0.50")) for name in "aab"
+        ),
+        data=pd.DataFrame(),
+    )
+    shown = [[cell.text for cell in row[:2]] for row in made.once()]
+    assert shown == [["Prior", "a"], ["", "a"], ["", "b"]]
+    assert made.rows[0][2].lines == ("1.00", "± 0.50")
+    assert table.Cell("lower: −5 % (−9 to −1)").lines == ("lower: −5 %", "(−9 to −1)")
+    assert table.Cell("0.5 [0.1, 0.9]").lines == ("0.5", "[0.1, 0.9]")
+    assert table.Cell("x").lines == ("x", "")
 
 
 def test_report_holds_every_part(tmp_path, figure):
@@ -175,7 +218,7 @@ def test_durations(seconds, said):
 def test_sections_without_items_are_left_out(tmp_path):
     found = Page(page(tmp_path, made_up(0.25), more=[report.lambda_section([])]))
     assert "Choice of λ" not in found.words
-    assert {"figures", "lambda"}.isdisjoint(found.ids)
+    assert {"level-figures", "lambda"}.isdisjoint(found.ids)
     assert {"findings", "tables"} <= found.ids
 
 
@@ -207,49 +250,52 @@ def even(gain, *, method="pca", **changes):
     )
 
 
-def spoken(metrics, spread=0.0):
-    return headlines(effects(metrics, spread=spread), metrics)
+def said(metrics, spread=0.0):
+    """Verdicts on clean targets by objects, prior, dataset and backbone."""
+    made = findings(metrics, spread=spread)[0]
+    return {
+        (row[0].text, row[1].text, *place): cell.text
+        for row in made.rows
+        for place, cell in zip(made.header[2:], row[2:], strict=True)
+    }
+
+
+PLACE = ("Known objects", "DINE-PCA", "DeformedTissue", "Robust-DefReg")
 
 
 @pytest.mark.parametrize(
-    ("gain", "spread", "said", "interval"),
+    ("gain", "spread", "verdict"),
     [
-        (0.25, 0.0, "DINE-PCA has a lower mean Chamfer distance than the control", "−25 to −25"),
-        (0.25, 0.1, "DINE-PCA has a lower mean Chamfer distance than the control", "−45 to −5"),
-        (0.25, 0.2, "whether DINE-PCA differs from the control is undecided", "−64 to +14"),
-        (-0.5, 0.0, "DINE-PCA has a higher mean Chamfer distance than the control", "+50 to +50"),
+        (0.25, 0.0, "lower: −25 % (−25 to −25)"),
+        (0.25, 0.1, "lower: −25 % (−45 to −5)"),
+        (0.25, 0.2, "undecided: −25 % (−64 to +14)"),
+        (-0.5, 0.0, "higher: +50 % (+50 to +50)"),
     ],
 )
-def test_headlines_say_what_the_interval_allows(gain, spread, said, interval):
-    (sentence,) = spoken(even(gain), spread=spread)
-    change = f"{-100 * gain:+.0f}".replace("-", "−")
-    place = "DeformedTissue with Robust-DefReg"
-    assert sentence == f"Known objects (synthetic data): {said} on {place} {change} % ({interval})."
+def test_findings_say_what_the_interval_allows(gain, spread, verdict):
+    assert said(even(gain), spread=spread) == {PLACE: verdict}
 
 
-def test_known_objects_come_first_and_each_prior_has_a_sentence():
+def test_known_objects_come_first_and_each_prior_has_a_row():
     unseen = even(-0.5, objects="unseen", dataset="deformedtissue_unseen")
     other = even(0.25, method="flow", backbone="deftransnet")
-    found = spoken(pd.concat([unseen, other, even(0.25)]))
-    beginnings = [" ".join(sentence.split()[:7]) for sentence in found]
-    assert beginnings == [
-        "Known objects (synthetic data): DINE-PCA has a",
-        "Known objects (synthetic data): DINE-Flow has a",
-        "Unseen objects (synthetic data): DINE-PCA has a",
+    found = said(pd.concat([unseen, other, even(0.25)]))
+    assert list(dict.fromkeys(key[:2] for key in found)) == [
+        ("Known objects", "DINE-PCA"),
+        ("Known objects", "DINE-Flow"),
+        ("Unseen objects", "DINE-PCA"),
     ]
-    assert "higher mean Chamfer distance than the control on DeformedTissue" in found[-1]
+    assert found["Unseen objects", *PLACE[1:]].startswith("higher: +50 %")
+    assert found["Known objects", "DINE-Flow", *PLACE[2:]] == "–"
 
 
-def test_a_headline_keeps_apart_what_is_decided_and_what_is_not():
+def test_findings_keep_apart_what_is_decided_and_what_is_not():
     few = even(-0.5, backbone="deftransnet")
     few = few[few["pair"].isin(sorted(few["pair"].unique())[:1])]
-    (sentence,) = spoken(pd.concat([even(0.25), few]))
-    lower, undecided = sentence.split("; ")
-    assert lower.endswith(
-        "than the control on DeformedTissue with Robust-DefReg −25 % (−25 to −25)"
-    )
+    found = said(pd.concat([even(0.25), few]))
+    assert found[PLACE] == "lower: −25 % (−25 to −25)"
     # No interval without clusters to draw.
-    assert undecided.endswith("is undecided on DeformedTissue with DefTransNet +50 %.")
+    assert found[*PLACE[:3], "DefTransNet"] == "undecided: +50 %"
 
 
 def test_strengths_of_a_condition_are_one_effect_of_pairs_drawn_together():
@@ -261,27 +307,23 @@ def test_strengths_of_a_condition_are_one_effect_of_pairs_drawn_together():
     ]
 
 
-def test_headlines_without_control_or_prior():
+def test_findings_without_control_or_prior(tmp_path):
     metrics = even(0.25)
     for lost in ("lambda0", "pca"):
-        (nothing,) = spoken(metrics[metrics["method"] != lost])
-        assert nothing.startswith("No prior was evaluated")
+        some = metrics[metrics["method"] != lost]
+        clean = [made for made in findings(some) if "clean" in made.title]
+        assert not clean
+    assert "No prior was evaluated" in Page(page(tmp_path, some)).words
 
 
-def test_overview_has_a_column_for_every_condition():
-    metrics = even(-0.5)
-    table = overview(effects(metrics), metrics)
-    assert [label for _, label in table.header] == [
-        *("Objects", "Dataset", "Backbone", "Prior", "CD, deformation", "CD, noise"),
-        *("MCE, deformation", "CD, deformation, against Stage 1"),
+def test_findings_have_a_row_for_every_condition_and_measure():
+    _, more = findings(even(-0.5))
+    assert [[cell.text for cell in row] for row in more.rows] == [
+        ["Chamfer distance, noise", *PLACE[:2], "higher: +50 % (+50 to +50)"],
+        ["Mean correspondence error", *PLACE[:2], "higher: +50 % (+50 to +50)"],
+        ["Chamfer distance, against Stage 1", *PLACE[:2], "higher: +20 % (+20 to +20)"],
     ]
-    assert [[cell.text for cell in row] for row in table.rows] == [
-        [
-            *("Known objects", "DeformedTissue", "Robust-DefReg", "DINE-PCA"),
-            *["higher: +50 % (+50 to +50)"] * 3,
-            "higher: +20 % (+20 to +20)",
-        ]
-    ]
+    assert {row[-1].verdict for row in more.rows} == {"higher"}
 
 
 def test_the_page_shows_effects_their_chance_and_where_they_were_made(tmp_path):
@@ -303,8 +345,8 @@ def test_links_must_be_relative(tmp_path, address):
 
 def test_figures_must_be_png(tmp_path):
     def with_figure(name):
-        picture = html.Picture("", tmp_path / name)
-        page(tmp_path, made_up(0.25), more=[html.PageSection("x", "X", [picture])])
+        drawn = html.picture("", tmp_path / name)
+        page(tmp_path, made_up(0.25), more=[html.PageSection("x", "X", [drawn])])
 
     with pytest.raises(DataError, match=r"none\.png cannot be read"):
         with_figure("none.png")

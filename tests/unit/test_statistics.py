@@ -12,12 +12,12 @@ from dine.evaluation.statistics import (
     SUMMARISED,
     cluster_bootstrap,
     compare,
+    comparisons,
     holm,
     mcnemar,
     paired,
     rank_biserial,
     summary,
-    verdicts,
     wilcoxon,
 )
 
@@ -368,7 +368,7 @@ def six_objects(seeds=1):
 )
 def test_verdicts_join_the_chance_of_pairs_and_of_training(spread, seeds, verdict):
     metrics = six_objects(seeds)
-    found = verdicts(metrics, "old", "mce", spread=spread)
+    found = comparisons(metrics, "old", ("mce",), spread=spread)
     row = only(found, level=0.5)
     assert (row["method"], row["pairs"], row["clusters"]) == ("new", 12, 6)
     assert row["relative"] == pytest.approx(-30)
@@ -385,12 +385,12 @@ def test_verdicts_join_the_chance_of_pairs_and_of_training(spread, seeds, verdic
 
 
 def test_verdicts_turn_with_the_reference_and_need_five_clusters():
-    turned = only(verdicts(six_objects(), "new", "mce"), level=0.5)
+    turned = only(comparisons(six_objects(), "new", ("mce",)), level=0.5)
     assert turned["verdict"] == "higher"
     metrics = six_objects()
     for lost, decided in ((["5"], True), (["4", "5"], False)):
         some = metrics[~metrics["cluster"].isin(lost)]
-        found = verdicts(some, "old", "mce")
+        found = comparisons(some, "old", ("mce",))
         assert set(found["verdict"]) == {"lower" if decided else "undecided"}
         assert found["low"].isna().all() == (not decided)
 
@@ -398,11 +398,11 @@ def test_verdicts_turn_with_the_reference_and_need_five_clusters():
 def test_verdicts_are_of_shared_pairs_and_need_the_reference():
     metrics = six_objects()
     part = metrics[metrics["method"] == "new"].iloc[2:].assign(method="part")
-    found = verdicts(pd.concat([metrics, part]), "old", "mce")
+    found = comparisons(pd.concat([metrics, part]), "old", ("mce",))
     assert only(found, level=0.5, method="part")["pairs"] == 10
-    assert verdicts(metrics, "absent", "mce").empty
+    assert comparisons(metrics, "absent", ("mce",)).empty
     elsewhere = metrics[metrics["method"] == "new"].assign(backbone="c")
-    assert set(verdicts(pd.concat([metrics, elsewhere]), "old", "mce")["backbone"]) == {"b"}
+    assert set(comparisons(pd.concat([metrics, elsewhere]), "old", ("mce",))["backbone"]) == {"b"}
 
 
 # ------------------------------------------------------------------------------------ summary

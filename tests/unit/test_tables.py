@@ -39,6 +39,9 @@ def row(method, pair, cd, **changes):
         "cd_observed": 2 * cd,
         "cd_unregistered": 0.01,
         "mce": 10 * cd,
+        "roughness_true": 0.25,
+        **dict.fromkeys(("hd95", "accuracy_2_5", "accuracy_5", "far_points"), 0.5),
+        **dict.fromkeys(("folding", "roughness", "seconds"), 0.5),
     }
     return {**values, **changes}
 

@@ -23,6 +23,7 @@ from dine.results import (
     evidence_names,
     figure_names,
     own_searches,
+    pca_priors,
     runs,
     table_names,
 )

@@ -41,6 +41,12 @@ rule figures:
         METRICS,
         [[run.predictions, run.point_errors, run.history] for run in RUNS],
         [FILES.data(dataset).pairs for dataset in CONFIG.datasets],
+        [
+            FILES.prior(dataset, backbone, prior)
+            for dataset in CONFIG.datasets
+            for backbone in CONFIG.backbones_of(dataset)
+            for prior in pca_priors(CONFIG, backbone)
+        ],
         PLAN.searches,
     output:
         figures=[

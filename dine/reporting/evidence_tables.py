@@ -11,8 +11,14 @@ import pandas as pd
 from dine.data.pairs import RESAMPLED
 from dine.evaluation.statistics import NO_BACKBONE
 from dine.reporting import names
-from dine.reporting.effects import verdict_cell
-from dine.reporting.evidence.comparisons import LARGE, EvidenceStatistics, at
+from dine.reporting.comparisons import (
+    LARGE,
+    EvidenceStatistics,
+    Place,
+    at,
+    training_chance,
+    verdict_cells,
+)
 from dine.reporting.names import (
     DASH,
     MARKS,
@@ -31,7 +37,6 @@ from dine.results import CLEAN
 
 LOWER, HIGHER = MARKS["lower"], MARKS["higher"]
 GOAL_CELLS = f"Levels with both {LOWER} / any {HIGHER}"
-Place = tuple[str, str]
 Row = Mapping[str, Any]
 _DIAGNOSED = {
     "dataset": "Dataset",
@@ -67,6 +72,13 @@ def _short_place(place: Place) -> str:
 
 def _marked(text: str, verdict: Any) -> str:
     return f"{text} {MARKS.get(verdict, '')}".strip()
+
+
+def written(comparisons: pd.DataFrame) -> pd.DataFrame:
+    """Comparisons as files of the evidence name them: ``verdict`` is of the test there."""
+    named = comparisons.rename(columns={"verdict": "decided", "significant": "verdict"})
+    last = ["low", "high", "decided"]
+    return named[[*(name for name in named if name not in last), *last]]
 
 
 # --------------------------------------------------------------------------------- in short
@@ -105,19 +117,39 @@ def basis_table(evidence: EvidenceStatistics) -> Table:
     return Table("basis", title, caption, **laid_out(columns), data=data.reset_index())
 
 
+def overview_table(evidence: EvidenceStatistics) -> Table:
+    """Lower, higher or undecided on clean targets: every method, at every place, by both values."""
+    columns = _methods(evidence, evidence.rivals)
+    for value, (long, _, _, _) in VALUES.items():
+        for place in evidence.places:
+            found = evidence.overall(place)
+            found = found[found["value"] == value]
+            columns[long, _short_place(place)] = verdict_cells(found, ["method"], evidence.rivals)
+    reference = evidence.title(evidence.reference)
+    caption = (
+        f"{_all_data(evidence)}, clean targets. Difference of the mean over all levels to "
+        f"{reference}, in percent of it, with its 95 % interval, of the pairs drawn by object. "
+        "Lower or higher: the interval holds no zero. Otherwise the matter is undecided."
+    )
+    caption += training_chance(evidence.spread) if evidence.spread else ""
+    title = f"Lower or higher than {reference}?"
+    return Table("", title, caption, **laid_out(columns), data=evidence.comparisons)
+
+
 def verdict_table(evidence: EvidenceStatistics, place: Place) -> Table:
     """Lower, higher or undecided: every method against the reference at a place."""
     data = pd.concat([evidence.overall(place, condition) for condition in (CLEAN, RESAMPLED)])
     data = data[data["method"].isin(evidence.rivals)]
     methods = list(dict.fromkeys(data["method"]))
-    found = data.set_index(["value", "condition", "method"]).to_dict("index")
-    levels = at(evidence.cells, place).groupby(["value", "method"])["verdict"].agg(list).to_dict()
+    levels = (
+        at(evidence.cells, place).groupby(["value", "method"])["significant"].agg(list).to_dict()
+    )
     columns = _methods(evidence, methods)
     for value, (long, _, _, _) in VALUES.items():
         for condition in dict.fromkeys(data["condition"]):
             label = "Clean targets" if condition == CLEAN else names.CONDITIONS[condition]
-            rows = [found.get((value, condition, name)) for name in methods]
-            columns[long, label] = [verdict_cell(row, "decided") for row in rows]
+            found = data[(data["value"] == value) & (data["condition"] == condition)]
+            columns[long, label] = verdict_cells(found, ["method"], methods)
         tallies = [levels.get((value, name), []) for name in methods]
         columns[long, f"Levels {LOWER} / {HIGHER}"] = [
             f"{x.count('lower')} / {x.count('higher')} of {len(x)}" for x in tallies
@@ -130,7 +162,7 @@ def verdict_table(evidence: EvidenceStatistics, place: Place) -> Table:
         f"its 95 % interval. Bold: lower. {LOWER} / {HIGHER}: levels of clean targets with a "
         "significantly lower and higher mean.",
         **laid_out(columns),
-        data=data,
+        data=written(data),
     )
 
 
@@ -210,7 +242,7 @@ def mean_table(
         return None
     keys = ["condition", "corruption", "level"]
     marks = at(evidence.comparisons, place)
-    marks = marks.loc[marks["value"] == value, ["method", *keys, "verdict"]]
+    marks = marks.loc[marks["value"] == value, ["method", *keys, "significant"]]
     shown = shown.merge(marks, on=["method", *keys], how="left")
     shown["mean"] = (scale * shown["mean"]).round(decimals)
     can_win = shown["method"].isin([evidence.reference, *evidence.rivals]) & ~shown["partial"]
@@ -245,7 +277,7 @@ def _mean_cell(row: Row, decimals: int) -> Cell:
     if pd.isna(row["mean"]):
         return Cell(DASH)
     text = f"{row['mean']:.{decimals}f}{PARTIAL if row['partial'] else ''}"
-    return Cell(_marked(text, row["verdict"]), bool(row["best"]))
+    return Cell(_marked(text, row["significant"]), bool(row["best"]))
 
 
 def _pooled(rows: Sequence[Row]) -> Columns:
@@ -299,7 +331,7 @@ def answer_table(
         columns[long, label] = [number(row[key], decimals, scale) for row in rows]
     columns[long, "Difference [95 % interval]"] = [_difference(x, decimals, scale) for x in rows]
     columns[long, "%"] = [
-        Cell(_marked(signed(row["relative"], 1), row["verdict"]), row["verdict"] in MARKS)
+        Cell(_marked(signed(row["relative"], 1), row["significant"]), row["significant"] in MARKS)
         for row in rows
     ]
     columns[long, "p"] = [p_value(row["p_holm"]) for row in rows]
@@ -320,7 +352,7 @@ def answer_table(
         "wins: pairs on which the method is lower."
         + (" Failures: pairs with an MCE above 0.1, p by McNemar's test." * (value == "mce")),
         **laid_out(columns),
-        data=data,
+        data=written(data),
     )
 
 

@@ -16,12 +16,14 @@ from dine.files import read_json
 from dine.priors.base import load_prior
 from dine.priors.pca import PCAPrior
 from dine.reporting import figures as draw
+from dine.reporting import views
 from dine.reporting.loading import load_metrics, origin_of
 from dine.reporting.names import display_name
 from dine.results import CLEAN, Results, figure_names, own_searches, pca_priors, runs, strengths
 
 HISTORY_WINDOW = 20
 """Steps over which training curves are averaged, since a step sees few pairs."""
+LAMBDA_TITLE = "Choice of λ"
 
 
 class Run:
@@ -31,18 +33,6 @@ class Run:
         self.files = Results(results)
         self.config = config
         self.metrics = load_metrics(self.files.run(*run).metrics for run in runs(config))
-        typical = "the median Stage-1 case at the largest level, coloured by error"
-        errors = "distribution of per-point squared distances, clean targets"
-        self._kinds = [
-            ("qualitative", "Before and after", typical, self.qualitative),
-            ("histogram", "Per-point errors", errors, self.histogram),
-            ("training", "Training", "training curves", self.training),
-        ]
-        explained = "variance explained by the components"
-        self._kinds_of_priors = [
-            ("spectrum", "The PCA prior", explained, self.spectrum),
-            ("modes", "The PCA prior", "the first modes", self.modes),
-        ]
 
     def origin(self, dataset: str) -> str:
         return origin_of(dataset, self.metrics)
@@ -54,18 +44,17 @@ class Run:
         }
 
     def qualitative(self, dataset: str, backbone: str) -> Figure:
-        pairs = read_pairs(self.files.data(dataset).pairs, split="test")
-        examples = draw.load_examples(
-            draw.pick_examples(dataset, backbone, self.metrics),
-            pairs,
+        examples = views.load_examples(
+            views.pick_examples(dataset, backbone, self.metrics),
+            read_pairs(self.files.data(dataset).pairs, split="test"),
             self._per_method(dataset, backbone, "predictions"),
             self._per_method(dataset, backbone, "point_errors"),
         )
-        return draw.qualitative_figure(examples, _title(dataset, backbone), self.origin(dataset))
+        return views.qualitative_figure(examples, _title(dataset, backbone), self.origin(dataset))
 
     def histogram(self, dataset: str, backbone: str) -> Figure:
         errors = {
-            method: draw.read_group(path, CLEAN, "squared_distance")[1]
+            method: views.read_group(path, CLEAN, "squared_distance")[1]
             for method, path in self._per_method(dataset, backbone, "point_errors").items()
         }
         title = f"{_title(dataset, backbone)}: per-point error, all levels"
@@ -92,7 +81,7 @@ class Run:
     def modes(self, dataset: str, backbone: str, name: str) -> Figure:
         prior = self._pca(dataset, backbone, name)
         source = read_pairs(self.files.data(dataset).pairs, split="test").source[0]
-        return draw.pca_modes_figure(
+        return views.pca_modes_figure(
             prior.mean.numpy().reshape(-1, 3),
             prior.modes(),
             np.array(prior.notes["explained_variance"]),
@@ -114,29 +103,45 @@ class Run:
         where = _title(search["dataset"], search["backbone"])
         return draw.search_figure([search], where, self.origin(search["dataset"]))
 
-    def all_figures(self) -> dict[str, tuple[str, str, Callable[[], Figure]]]:
+    def figures(self) -> dict[str, tuple[str, str, Callable[[], Figure]]]:
         """Section of the report, caption and drawing function of every figure, by file stem."""
         found: dict[str, tuple[str, str, Callable[[], Figure]]] = {}
         for dataset in self.config.datasets:
-            shown = display_name(dataset)
             for kind in (CLEAN, *strengths(self.config, dataset)):
                 make = partial(draw.distance_figure, dataset, self.metrics, kind)
-                caption = f"Mean Chamfer distance on {shown}."
-                found[f"distance_{dataset}_{kind}"] = (f"Accuracy on {shown}", caption, make)
+                caption = f"Mean Chamfer distance on {display_name(dataset)}."
+                found[f"distance_{dataset}_{kind}"] = ("Tables", caption, make)
             for backbone in self.config.backbones_of(dataset):
-                of_priors = [
-                    (*kind, name)
-                    for kind in self._kinds_of_priors
-                    for name in pca_priors(self.config, backbone)
-                ]
-                for name, section, text, make, *prior in [*self._kinds, *of_priors]:
-                    caption = f"{_title(dataset, backbone)}: {text}."
-                    drawn = partial(make, dataset, backbone, *prior)
-                    found["_".join([name, dataset, backbone, *prior])] = (section, caption, drawn)
+                place = (dataset, backbone)
+                kinds = [((name,), *about) for name, about in _OF_PLACES.items()]
+                for prior in pca_priors(self.config, backbone):
+                    kinds += [((name, prior), *about) for name, about in _OF_PRIORS.items()]
+                for (name, *prior), section, text in kinds:
+                    make = partial(getattr(self, name), *place, *prior)
+                    stem = "_".join([name, *place, *prior])
+                    found[stem] = (section, f"{_title(*place)}: {text}.", make)
         for name, path in self.searches().items():
             caption = f"Validation errors over λ, {display_name(read_json(path)['backbone'])}."
-            found[name] = ("Choice of λ", caption, partial(self.search, path))
+            found[name] = (LAMBDA_TITLE, caption, partial(self.search, path))
         return {name: found[name] for name in figure_names(self.config)}
+
+
+_OF_PLACES = {
+    "qualitative": (
+        "Before and after",
+        "the median Stage-1 case at the largest level, coloured by error",
+    ),
+    "histogram": (
+        "Per-point errors",
+        "distribution of per-point squared distances, clean targets",
+    ),
+    "training": ("Training", "training curves"),
+}
+"""Section and caption of the figures of a dataset with a backbone, by the method that draws."""
+_OF_PRIORS = {
+    "spectrum": ("The PCA prior", "variance explained by the components"),
+    "modes": ("The PCA prior", "the first modes"),
+}
 
 
 def _title(dataset: str, backbone: str) -> str:
@@ -145,5 +150,5 @@ def _title(dataset: str, backbone: str) -> str:
 
 def draw_figures(results: Path, config: Config, out: Path) -> None:
     """Draw every figure of a run as PNG and PDF into ``out``."""
-    for name, (_, _, make) in Run(results, config).all_figures().items():
+    for name, (_, _, make) in Run(results, config).figures().items():
         draw.save_figure(make(), out / name)

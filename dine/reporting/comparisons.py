@@ -1,25 +1,31 @@
-"""How every method compares with the reference."""
+"""How methods compare with a reference: the one way in which tables, figures and pages do it.
+
+Every number comes by way of :func:`dine.evaluation.statistics.comparisons`; so do the verdicts. A
+*place* is a dataset with a backbone. Methods without a network are shown at every place of their
+datasets.
+"""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from dine.config import CONTROL
+from dine.config import CONTROL, STAGE1
 from dine.errors import DataError
 from dine.evaluation import statistics
 from dine.evaluation.statistics import NO_BACKBONE
 from dine.reporting import names
-from dine.reporting.loading import origin_of, read_metrics
-from dine.reporting.names import display_name, rank
-from dine.results import CLEAN
+from dine.reporting.loading import origin_of
+from dine.reporting.names import DASH, change, display_name, in_order, rank
+from dine.reporting.table import Cell
+from dine.results import CLEAN, trained_on
 
+Place = tuple[str, str]
 GROUPS = {
     "none": "Unregistered",
     "classical": "Classical",
@@ -35,13 +41,55 @@ PAPER_PRIOR = "pca"
 LARGE = 0.4
 """Deformation level from which on deformations count as large."""
 
-_NUMBERS = ("seed", "level", "corruption", *statistics.SUMMARISED, "roughness_true")
 _PLACE = ["dataset", "backbone"]
 
 
-def load_evidence(paths: Iterable[Path]) -> pd.DataFrame:
-    """``read_metrics``, with all that the tables here summarise."""
-    return read_metrics(paths, _NUMBERS)
+def effects(
+    metrics: pd.DataFrame, reference: str = CONTROL, value: str = "cd", *, spread: float = 0.0
+) -> pd.DataFrame:
+    """Every prior against a reference under each condition, all its levels and strengths together.
+
+    The columns of ``statistics.comparisons``, and ``objects``, ``known`` or ``unseen``.
+    """
+    # A pair counts once for each strength; drawn by cluster, its rows stay together.
+    strength = metrics["corruption"].map("{:g}".format)
+    pooled = metrics.assign(corruption=0.0, level=np.nan, pair=metrics["pair"] + " " + strength)
+    pooled = pooled[pooled[value].notna()]
+    found = statistics.comparisons(pooled, reference, (value,), spread=spread)
+    found = found[~found["method"].isin([STAGE1, CONTROL])]
+    kinds = metrics.groupby("dataset")["objects"].first()
+    found = found.assign(objects=found["dataset"].map(kinds))
+    return in_order(found, ["objects", "method", "dataset", "backbone"])
+
+
+def verdict_cells(data: pd.DataFrame, keys: list[str], rows: Iterable[Any]) -> list[Cell]:
+    """Verdicts with the difference in percent of the reference and its interval.
+
+    Args:
+        data: comparisons, of one place and value.
+        keys: what tells its rows apart.
+        rows: the values of ``keys`` in the rows of the table; a dash where there are none.
+    """
+    found = data.set_index(keys).to_dict("index")
+    cells = []
+    for key in rows:
+        row = found.get(key)
+        if row is None:
+            cells.append(Cell(DASH))
+        else:
+            said = change(row["relative"], row["low"], row["high"])
+            verdict = row["verdict"]
+            cells.append(Cell(f"{verdict}: {said}", verdict == "lower", verdict))
+    return cells
+
+
+def training_chance(spread: float) -> str:
+    """What an interval holds besides the chance of the pairs; ``spread`` is a share."""
+    return (
+        " It also holds the chance of the training: another seed, or another CPU's rounding, gives "
+        f"another network, whose difference varies by {100 * spread:g} % of the reference "
+        "(standard deviation; evaluation.training_spread)."
+    )
 
 
 @dataclass(frozen=True)
@@ -78,17 +126,15 @@ def _known_methods(
 
 
 class EvidenceStatistics:
-    """The statistics behind the report, each computed once and only when it is asked for.
-
-    A *place* is a dataset with a backbone.
+    """The comparisons behind the evidence, each computed once and only when it is asked for.
 
     Args:
-        metrics: as ``load_evidence`` returns them.
+        metrics: as ``load_metrics`` returns them.
         methods: title, group and description by method; see ``build_evidence``.
         reference: what all methods are compared with.
         aside: backbones and datasets that are shown, but neither count for the goal nor for the
             order of methods.
-        spread: how much differences vary with the training; see ``statistics.decided``.
+        spread: how much differences vary with the training; see ``statistics.comparisons``.
 
     Raises:
         DataError: the reference is missing, nothing can be compared with it, or a group is unknown.
@@ -116,11 +162,13 @@ class EvidenceStatistics:
         self.places = self._places()
         # Few methods are tried with such backbones, so they would decide which can win at all; and
         # such datasets are too small to.
-        self.judged = [p for p in self.places if not set(p) & set(aside)] or self.places
+        self.judged = [
+            place for place in self.places if not {trained_on(place[0]), place[1]} & set(aside)
+        ] or self.places
         if self.comparisons.empty:
             raise DataError(f"The metrics hold no method to compare with {reference!r}.")
 
-    def _places(self) -> list[tuple[str, str]]:
+    def _places(self) -> list[Place]:
         found = {
             (dataset, backbone)
             for dataset, rows in self.metrics.groupby("dataset")
@@ -167,11 +215,7 @@ class EvidenceStatistics:
 
     @functools.cached_property
     def comparisons(self) -> pd.DataFrame:
-        """``statistics.comparisons`` of every method, in their order, with what follows.
-
-        ``verdict`` is of the test (``statistics.significant``); ``low``, ``high`` and ``decided``
-        are those of ``statistics.decided``, which also holds the chance of the training.
-        """
+        """``statistics.comparisons`` of every method, in their order."""
         return self._compared(self.metrics)
 
     @functools.cached_property
@@ -181,11 +225,7 @@ class EvidenceStatistics:
         return self._compared(self.large_rows.assign(level=np.nan))
 
     def _compared(self, metrics: pd.DataFrame) -> pd.DataFrame:
-        table = statistics.comparisons(metrics, self.reference)
-        if table.empty:
-            return table.reindex(columns=[*table.columns, "verdict"])
-        found = statistics.decided(table, self.spread).rename(columns={"verdict": "decided"})
-        table = table.assign(verdict=statistics.significant(table)).join(found)
+        table = statistics.comparisons(metrics, self.reference, spread=self.spread)
         return self._in_order(table, "method", *_PLACE)
 
     def _in_order(self, table: pd.DataFrame, *keys: str) -> pd.DataFrame:
@@ -203,7 +243,7 @@ class EvidenceStatistics:
         table = self.comparisons
         return table[(table["condition"] == CLEAN) & table["level"].notna()]
 
-    def overall(self, place: tuple[str, str], condition: str = CLEAN) -> pd.DataFrame:
+    def overall(self, place: Place, condition: str = CLEAN) -> pd.DataFrame:
         """``comparisons`` under a condition, all levels together, at a place."""
         table = at(self.comparisons, place)
         return table[(table["condition"] == condition) & table["level"].isna()]
@@ -221,10 +261,10 @@ class EvidenceStatistics:
         keys = [*_PLACE, "method"]
         some = pd.concat([at(self.cells, place) for place in self.judged])
         some = some[(some["level"] >= LARGE) & some["method"].isin(self.rivals)]
-        lower = some["verdict"] == "lower"
+        lower = some["significant"] == "lower"
         by_value = {value: lower & (some["value"] == value) for value in ("mce", "cd")}
         some = some.assign(**by_value, below=some["difference"] < 0)
-        levels = some.assign(worse=some["verdict"] == "higher").groupby([*keys, "level"])
+        levels = some.assign(worse=some["significant"] == "higher").groupby([*keys, "level"])
         counts = levels[["mce", "cd", "worse"]].any()
         counts.insert(0, "both", counts["mce"] & counts["cd"])
         counts.insert(1, "both_lower", levels["below"].sum() == 2)
@@ -283,7 +323,7 @@ class EvidenceStatistics:
         return table.assign(partial=table["pairs"] < most)
 
     def ranking(
-        self, methods: Sequence[str], value: str, places: Sequence[tuple[str, str]] | None = None
+        self, methods: Sequence[str], value: str, places: Sequence[Place] | None = None
     ) -> pd.Series:
         """Mean over places of the mean at large levels, lowest first, of methods seen at all."""
         places = self.judged if places is None else places
@@ -315,6 +355,6 @@ class EvidenceStatistics:
         return self._at_places(means)
 
 
-def at(table: pd.DataFrame, place: tuple[str, str]) -> pd.DataFrame:
+def at(table: pd.DataFrame, place: Place) -> pd.DataFrame:
     """Rows of one place."""
     return table[(table["dataset"] == place[0]) & (table["backbone"] == place[1])]
