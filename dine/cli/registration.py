@@ -125,7 +125,14 @@ registration_options = gathered(
         default=True,
         help="Go on from the points to the surfaces that they were drawn on; by default.",
     ),
-    click.option("--partial", is_flag=True, help="The target shows a part of the source only."),
+    click.option(
+        "--overlap",
+        type=click.Choice(["auto", "both", "source-in-target", "target-in-source"]),
+        default="auto",
+        help="Which part each scan shows: the same (parts that overlap, if that fails), each what "
+        "the other does not, or one a part of the other.",
+    ),
+    click.option("--partial", is_flag=True, help="The same as --overlap target-in-source."),
     click.option(
         "--points",
         type=click.IntRange(16),
@@ -143,7 +150,8 @@ view_option = click.option("--view", is_flag=True, help="Also write a page to tu
 
     \b
     dine register before.ply after.ply -o moved.ply --view
-    dine register ct.stl us.obj -o moved.stl --apply tumour.stl --partial
+    dine register ct.stl us.obj -o moved.stl --apply tumour.stl --overlap target-in-source
+    dine register ct.stl us.obj -o moved.stl --guide ct.fcsv us.fcsv --guide-error 2
     dine register liver.ply scan.ply -o moved.ply --prior organ.prior --partial
     """
 )
@@ -161,6 +169,17 @@ view_option = click.option("--view", is_flag=True, help="Also write a page to tu
         type=IN,
         nargs=2,
         help="Corresponding points of source and target, to measure.",
+    ),
+    click.option(
+        "--guide",
+        type=IN,
+        nargs=2,
+        help="Corresponding points of source and target, to keep to.",
+    ),
+    click.option(
+        "--guide-error",
+        type=click.FloatRange(0, min_open=True),
+        help="Standard deviation of their coordinates; by default 1 % of the source's radius.",
     ),
 )
 @registration_options
@@ -190,6 +209,7 @@ def register(source, target, out, further, settings, writing, load_model):
     outputs.check(shapes, **writing)
     moving = read_surface(source)
     check_holds(out, moving)
+    settings["guide"], settings["guide_error"] = further["guide"] or None, further["guide_error"]
     marks = landmarks or None
     result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
     said = save(result, outputs, applied=shapes, **writing)

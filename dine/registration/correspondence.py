@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,19 +16,73 @@ from dine.errors import ConfigError, DataError
 from dine.geometry.distance import distances
 from dine.geometry.frame import Frame
 from dine.geometry.interpolation import FittedDisplacement
-from dine.geometry.rigid import Alignment, check_rigid, rigid_alignments
+from dine.geometry.rigid import (
+    Alignment,
+    check_rigid,
+    motion_between,
+    overlapping_alignments,
+    rigid_alignments,
+)
 from dine.geometry.surface import Surface
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.refinement.refine import ROUNDS, Observed, Options, refine
 from dine.registration.shapes import FEWEST, drawn
 from dine.registration.surfaces import refined_on_surfaces
-from dine.registration.types import Correspondence, Model, Pair, Settings
+from dine.registration.types import Correspondence, Model, Overlap, Pair, Settings
 
 # A source point is shown by the target if a target point ends up within so many spacings of it.
 _RETURN = 3.0
 # Points that end so close to each other are the same, and the share of such from which all are.
 _SAME = 1e-9
 _SHARED = 0.5
+# Share of a scan without counterpart from which scans are tried as parts that overlap.
+_LACKING = 0.1
+# What another alignment than none must lower the improbability to, where scans overlap.
+_MUCH_BETTER = 0.5
+
+
+def correspondence_of(
+    source: Surface, target: Surface, model: Model, settings: Settings
+) -> tuple[Pair, Correspondence]:
+    """Points of both scans, aligned, and where those of the source belong.
+
+    Raises:
+        DataError: too few points, points on a line, a matrix that is not rigid, or a part that ends
+            up beside the other scan.
+        ConfigError: unusable settings.
+    """
+    _check(settings)
+    pairs = aligned_pairs(source, target, settings, model.convention)
+    found = _most_probable(pairs, model, settings)
+    if settings.overlap is Overlap.AUTO and settings.prealign == "auto" and _lacks(found[1]):
+        settings = replace(settings, overlap=Overlap.BOTH)
+        pairs = aligned_pairs(source, target, settings, model.convention)
+        found = min(found, _most_probable(pairs, model, settings), key=lambda one: one[1].unmet)
+    return found
+
+
+def _check(settings: Settings) -> None:
+    rounds = settings.rounds
+    if rounds < 0:
+        raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
+    if settings.overlap is Overlap.BOTH and not (settings.surfaces and rounds):
+        raise ConfigError(
+            "Where each scan shows what the other does not (overlap both), only surfaces tell what "
+            "belongs together; allow surfaces and rounds of refinement."
+        )
+    if settings.guide is not None and not (settings.surfaces and rounds):
+        raise ConfigError(
+            "Landmarks guide the refinement on surfaces only; allow surfaces and rounds of "
+            "refinement."
+        )
+
+
+def _lacks(found: Correspondence) -> bool:
+    """Whether much of the surfaces has no counterpart: more than one scan lacks by a hole."""
+    if found.unmet is None:
+        return False
+    parts = min(found.shown) < 1 - _LACKING and max(found.shown) < 1 - _LACKING / 5
+    return parts or found.unmet > _LACKING
 
 
 def aligned_pairs(
@@ -62,46 +117,66 @@ def _motions(settings: Settings, source: np.ndarray, target: np.ndarray) -> list
     if how == "off":
         return [np.eye(4)]
     if how == "auto":
-        return rigid_alignments(source, target, partial=settings.partial)
+        if settings.guide is not None and settings.guide.tells_rotation:
+            return [motion_between(settings.guide.here, settings.guide.there)]
+        return _RIGID[settings.overlap](source, target)
     raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
 
 
-def most_probable(
+_RIGID = {
+    Overlap.AUTO: rigid_alignments,
+    Overlap.BOTH: overlapping_alignments,
+    Overlap.TARGET_IN_SOURCE: partial(rigid_alignments, partial=True),
+    # What brings the target onto a part of it, undone.
+    Overlap.SOURCE_IN_TARGET: lambda source, target: [
+        np.linalg.inv(motion) for motion in rigid_alignments(target, source, partial=True)
+    ],
+}
+
+
+def _most_probable(
     pairs: Sequence[Pair], model: Model, settings: Settings
 ) -> tuple[Pair, Correspondence]:
     """Of several alignments the one whose correspondence explains the surfaces best.
 
-    The first where surfaces are not looked at, or little of the source is to be seen.
+    The first where surfaces are not looked at, or little of one scan is to be seen.
     """
     found = [(pairs[0], correspond(pairs[0], model, settings))]
-    if found[0][1].improbability is not None and not settings.partial:
+    symmetric = settings.overlap in (Overlap.AUTO, Overlap.BOTH)
+    if found[0][1].improbability is not None and symmetric:
         found += [(pair, correspond(pair, model, settings)) for pair in pairs[1:]]
-    return min(found, key=lambda one: one[1].improbability or 0.0)
+    if settings.overlap is not Overlap.BOTH:
+        return min(found, key=lambda one: one[1].improbability or 0.0)
+    # Parts can fit by chance. Scans of one frame, which is the first, seldom do.
+    first, *others = found
+    best = min(others, key=lambda one: one[1].improbability, default=first)
+    return best if best[1].improbability < _MUCH_BETTER * first[1].improbability else first
 
 
 def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:
     """Where the source's points belong.
 
     Raises:
-        ConfigError: a negative number of rounds.
-        DataError: with ``partial``, the part ends up beside the source.
+        DataError: the target, a part of the source, ends up beside it.
     """
-    rounds = settings.rounds
-    if rounds < 0:
-        raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
     found = _from_points(pair, model, settings)
-    if not (settings.surfaces and rounds):
+    if not (settings.surfaces and settings.rounds):
         return found
     # Scans that hold the same points say of each where it went.
-    if (distances(found.moved, pair.goal) < _SAME).mean() >= _SHARED:
+    if settings.guide is None and (distances(found.moved, pair.goal) < _SAME).mean() >= _SHARED:
         return replace(found, indicator=np.zeros(len(found.start)))
     return refined_on_surfaces(pair, found, settings)
 
 
 def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence:
-    """What the drawn points alone say."""
-    if settings.partial:
+    """What the drawn points alone say; nothing where each scan has some that the other lacks."""
+    if settings.overlap is Overlap.BOTH:
+        return _still(pair)
+    if settings.overlap is Overlap.TARGET_IN_SOURCE:
         return _from_part(pair.start, pair.goal, settings.rounds)
+    if settings.overlap is Overlap.SOURCE_IN_TARGET:
+        options = Options(settings.rounds, part=True)
+        return replace(_still(pair), field=refine(pair.start, pair.goal, options=options).mean)
     there = one_way(model.backbone, pair.start, pair.goal, settings)
     if settings.surfaces and settings.rounds:
         return there  # surfaces will say more
@@ -110,6 +185,12 @@ def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence
     seen, whole = frame.normalise(pair.goal), frame.normalise(pair.start)
     back = one_way(model.backbone, seen, whole, settings).field * frame.scale
     return replace(there, inconsistency=_inconsistency(there, back))
+
+
+def _still(pair: Pair) -> Correspondence:
+    """No displacement."""
+    start = pair.start
+    return Correspondence(start, pair.goal, np.zeros_like(start), None, np.ones(len(start), bool))
 
 
 def one_way(
@@ -169,7 +250,7 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> Corresponden
     if supported.sum() < FEWEST:
         raise DataError(
             "Hardly any part of the source is found in the target; check that both show the same "
-            "object, or leave out `partial`."
+            "object, or leave the overlap to `auto`."
         )
     return Correspondence(start, goal, FittedDisplacement(places, -back)(start), None, supported)
 

@@ -161,7 +161,7 @@ def test_surface_distance_is_what_its_names_say():
     assert found["hausdorff"] == pytest.approx(max(there.max(), back.max()))
     expected = max(np.percentile(there, 95), np.percentile(back, 95))
     assert found["hd95"] == pytest.approx(expected)
-    assert surface_distance(a, b, partial=True)["chamfer"] == pytest.approx((back**2).mean())
+    assert surface_distance(a, b, shown=(0, 1))["chamfer"] == pytest.approx((back**2).mean())
 
 
 def test_folding_is_the_share_turned_inside_out():
@@ -479,7 +479,7 @@ def test_vertices_without_faces_take_no_part(pair, result, kind):
 
 
 def test_landmarks_are_checked_before_anything_is_computed(pair, monkeypatch):
-    monkeypatch.setattr(register_module, "aligned_pairs", lambda *args: pytest.fail("computed"))
+    monkeypatch.setattr(register_module, "correspondence_of", lambda *args: pytest.fail("computed"))
     points = pair[0].vertices[:5]
     for marks in ((points, points[:4]), (points[:, :2], points[:, :2])):
         with pytest.raises(DataError, match="expected as many rows of three coordinates"):
@@ -579,7 +579,7 @@ def test_command_keeps_what_is_known_of_vertices(files, tmp_path, pair):
 
 
 def test_command_probes_its_output_first(files, tmp_path, monkeypatch):
-    monkeypatch.setattr(register_module, "aligned_pairs", lambda *args: pytest.fail("computed"))
+    monkeypatch.setattr(register_module, "correspondence_of", lambda *args: pytest.fail("computed"))
     (tmp_path / "afile").write_text("precious")
     np.savetxt(tmp_path / "cloud.xyz", organ().vertices)
     for source, out, said in (
