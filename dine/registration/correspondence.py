@@ -37,7 +37,8 @@ _SAME = 1e-9
 _SHARED = 0.5
 # Share of a scan without counterpart from which scans are tried as parts that overlap.
 _LACKING = 0.1
-# What another alignment than none must lower the improbability to, where scans overlap.
+_AS_WELL = 0.02
+# What a less likely alignment must lower the improbability to, where scans overlap.
 _MUCH_BETTER = 0.5
 
 
@@ -57,7 +58,9 @@ def correspondence_of(
     if settings.overlap is Overlap.AUTO and settings.prealign == "auto" and _lacks(found[1]):
         settings = replace(settings, overlap=Overlap.BOTH)
         pairs = aligned_pairs(source, target, settings, model.convention)
-        found = min(found, _most_probable(pairs, model, settings), key=lambda one: one[1].unmet)
+        parts = _most_probable(pairs, model, settings)
+        if parts[1].unmet < found[1].unmet + _AS_WELL:
+            return parts
     return found
 
 
@@ -147,10 +150,12 @@ def _most_probable(
         found += [(pair, correspond(pair, model, settings)) for pair in pairs[1:]]
     if settings.overlap is not Overlap.BOTH:
         return min(found, key=lambda one: one[1].improbability or 0.0)
-    # Parts can fit by chance. Scans of one frame, which is the first, seldom do.
-    first, *others = found
-    best = min(others, key=lambda one: one[1].improbability, default=first)
-    return best if best[1].improbability < _MUCH_BETTER * first[1].improbability else first
+    # Once bent, parts can fit by chance. How they lie says more: the likeliest come first.
+    best = found[0]
+    for one in found[1:]:
+        if one[1].improbability < _MUCH_BETTER * best[1].improbability:
+            best = one
+    return best
 
 
 def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:

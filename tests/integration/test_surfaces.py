@@ -141,7 +141,7 @@ def test_landmarks_guide_where_surfaces_leave_it_open():
     settings = {"prealign": "off", "guide": guide, "guide_error": 0.3}
     guided = dine.register(source, target, **settings)
     free = dine.register(source, target, prealign="off")
-    assert mean_error(guided.moved.vertices, truth) < 1.5
+    assert mean_error(guided.moved.vertices, truth) < 2.5
     assert mean_error(free.moved.vertices, truth) > 5
     assert guided.report["settings"]["guides"] == len(marked)
     # Enough of them say how the source lies, too.
@@ -158,7 +158,7 @@ def test_landmarks_guide_where_surfaces_leave_it_open():
         ({"overlap": "both", "rounds": 0}, "only surfaces tell what belongs together"),
         ({"guide": (np.eye(3), np.eye(3)), "surfaces": False}, "Landmarks guide the refinement"),
         ({"guide": (np.eye(3), np.eye(3)), "guide_error": 0.0}, "error of the guiding landmarks"),
-        ({"guide": (np.eye(3), np.eye(3)[:2])}, "as many rows of three coordinates"),
+        ({"guide": (np.eye(3), np.eye(3)[:2])}, "The landmarks have shapes"),
         ({"overlap": "both", "prior": "none.prior"}, "expected auto or target-in-source"),
         ({"guide": (np.eye(3), np.eye(3)), "prior": "none.prior"}, "no network to choose guide"),
     ],
