@@ -115,7 +115,14 @@ registration_options = gathered(
         default=True,
         help="Go on from the points to the surfaces that they were drawn on; by default.",
     ),
-    click.option("--partial", is_flag=True, help="The target shows a part of the source only."),
+    click.option(
+        "--overlap",
+        type=click.Choice(["auto", "both", "source-in-target", "target-in-source"]),
+        default="auto",
+        help="Which part each scan shows: the same (parts that overlap, if that fails), each what "
+        "the other does not, or one a part of the other.",
+    ),
+    click.option("--partial", is_flag=True, help="The same as --overlap target-in-source."),
     click.option(
         "--points",
         type=click.IntRange(16),
@@ -187,7 +194,8 @@ class _Writing:
 
     \b
     dine register before.ply after.ply -o moved.ply --view
-    dine register ct.stl us.obj -o moved.stl --apply tumour.stl --partial
+    dine register ct.stl us.obj -o moved.stl --apply tumour.stl --overlap target-in-source
+    dine register ct.stl us.obj -o moved.stl --guide ct.fcsv us.fcsv --guide-error 2
     dine register liver.ply scan.ply -o moved.ply --prior organ.prior --partial
     """
 )
@@ -212,6 +220,17 @@ class _Writing:
         type=IN,
         nargs=2,
         help="Corresponding points of source and target, to measure.",
+    ),
+    click.option(
+        "--guide",
+        type=IN,
+        nargs=2,
+        help="Corresponding points of source and target, to keep to.",
+    ),
+    click.option(
+        "--guide-error",
+        type=click.FloatRange(0, min_open=True),
+        help="Standard deviation of their coordinates; by default 1 % of the source's radius.",
     ),
 )
 @registration_options
@@ -239,6 +258,8 @@ def register(source, target, further, settings, writing, load_model, grids):
         moving, grids = read_surface(source), grids()
         check_holds(writing.out, moving)
         grids.check(moving, overwrite=writing.overwrite)
+        settings["guide"] = further["guide"] or None
+        settings["guide_error"] = further["guide_error"]
         marks = landmarks or None
         result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
         stages.begin("writing")

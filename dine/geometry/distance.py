@@ -32,18 +32,23 @@ def distance_measures(*directions: np.ndarray) -> dict[str, float]:
 
 
 def surface_distance(
-    moved: np.ndarray, target: np.ndarray, *, partial: bool = False
+    moved: np.ndarray, target: np.ndarray, *, shown: tuple[float, float] = (1.0, 1.0)
 ) -> dict[str, float]:
     """How far (N, 3) moved points are from (M, 3) target points, in their units.
 
     Named as in :func:`distance_measures`.
 
-    With ``partial`` only the distances from the target count: source regions that the target does
-    not show are not held against the result.
+    Only the shares ``shown`` of the moved and of the target points count, the nearest ones: what
+    the other scan does not show is not held against the result. A share of 0 leaves the direction
+    out.
     """
-    directions = [distances(target, moved)]
-    if not partial:
-        directions.append(distances(moved, target))
+    directions = []
+    # From the target first: sums of floating-point numbers depend on their order.
+    for points, others, share in ((target, moved, shown[1]), (moved, target, shown[0])):
+        if share > 0:
+            apart = distances(points, others)
+            counted = max(1, round(share * len(apart)))
+            directions.append(np.sort(apart)[:counted] if counted < len(apart) else apart)
     return distance_measures(*directions)
 
 

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh.registration
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from dine.errors import DataError
 from dine.geometry.frame import Frame
+from dine.geometry.oriented import evenly
 
 # A rigid motion must lower the mean squared distance this much, or deformations of round objects
 # would pass for rotations; so must starts at other rotations, or symmetric objects would be turned.
 _MUCH_BETTER = 0.5
+# Where scans overlap: points looked at; distances, in median radii, that count a quarter, at first
+# and last; rounds; how far motions that are the same are apart; and how many are given beside none.
+_FEWER = 400
+_WIDE, _NARROW = 0.8, 0.1
+_ROUNDS = 20
+_ALIKE = 0.1
+_TRIED = 3
 _ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
 
 
@@ -112,6 +121,67 @@ def rigid_alignments(
     for motion in motions:
         motion[:3, 3] = size * motion[:3, 3] + centre - motion[:3, :3] @ centre
     return motions
+
+
+def overlapping_alignments(source: np.ndarray, target: np.ndarray) -> list[np.ndarray]:
+    """4×4 rigid motions that may bring (N, 3) source points onto (M, 3) target points, of which
+    each has some that the other lacks: no motion, and then those that fit best.
+
+    Iterative closest points both ways, whose weights fall off with the distance (Geman and
+    McClure), from no motion and from rotations that cover all evenly. Which of them is right shows
+    only once the source is deformed, so several are given, no two alike.
+    """
+    centre = np.median(source, axis=0)
+    size = float(np.median(np.linalg.norm(source - centre, axis=1))) or 1.0
+    a, b = ((points - centre) / size for points in (source, target))
+    a, b = (points[evenly(points, _FEWER)] for points in (a, b))
+    tree = cKDTree(b)
+    found = [_robust(a, b, tree, start) for start in _robust_starts(a, b)]
+    found.sort(key=lambda one: one[0])
+    chosen = [np.eye(4)]
+    for _, motion in found:
+        apart = [np.linalg.norm(transformed(a, motion) - transformed(a, x), axis=1) for x in chosen]
+        if len(chosen) <= _TRIED and min(x.mean() for x in apart) > _ALIKE:
+            chosen.append(motion)
+    for motion in chosen:
+        motion[:3, 3] = size * motion[:3, 3] + centre - motion[:3, :3] @ centre
+    return chosen
+
+
+def _robust_starts(a: np.ndarray, b: np.ndarray) -> Iterator[np.ndarray]:
+    """No motion, coinciding middles, and middles turned by each of the 24 rotations of a cube, from
+    the axes of the files and from the principal ones."""
+    yield np.eye(4)
+    turns = Rotation.create_group("O").as_matrix()
+    for frame in (np.eye(3), _between_axes(a, b)[0]):
+        for turn in turns:
+            yield _between_middles(a, b, frame @ turn)
+
+
+def _robust(
+    a: np.ndarray, b: np.ndarray, tree: cKDTree, motion: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """How badly what is found from a start fits, and the 4×4 motion."""
+    for reach in np.geomspace(_WIDE, _NARROW, _ROUNDS):
+        moved = transformed(a, motion)
+        (there, to), (back, asked) = tree.query(moved), cKDTree(moved).query(b)
+        ours = np.concatenate([np.arange(len(a)), asked])
+        theirs = np.concatenate([to, np.arange(len(b))])
+        squared = np.concatenate([there, back]) ** 2 / reach**2
+        weight = 1 / (1 + squared) ** 2
+        motion = motion_between(a[ours], b[theirs], weight)
+    return float((squared / (1 + squared)).mean()), motion
+
+
+def motion_between(a: np.ndarray, b: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
+    """The 4×4 rigid motion of least squared distances, weighted by (n,), of corresponding points
+    (n, 3), which do not lie on a line."""
+    middles = [np.average(points, axis=0, weights=weight) for points in (a, b)]
+    turn, _ = Rotation.align_vectors(b - middles[1], a - middles[0], weights=weight)
+    motion = np.eye(4)
+    motion[:3, :3] = turn.as_matrix()
+    motion[:3, 3] = middles[1] - motion[:3, :3] @ middles[0]
+    return motion
 
 
 def _motions(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> list[np.ndarray]:

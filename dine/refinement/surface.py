@@ -51,8 +51,11 @@ class SurfaceOptions:
         reach: distance, in standard deviations, at which the weight has fallen to a quarter.
         steepest: largest angle between the normals of a match, in degrees.
         turning: half the distance, in standard deviations, that counts as much as opposite normals.
-        part: the target shows a part of the source; its points then look for source points, but not
-            the other way, and surfaces end anywhere.
+        missing: what a point past the place where the other scan ends costs, as a share of what one
+            costs that should lie on it and does not.
+        source_looks: source points look for target points, as they should not where the target
+            shows a part of the source.
+        target_looks: likewise. Where only one of the scans looks, surfaces end anywhere.
     """
 
     firsts: tuple[float, ...] = (0.08, 0.2)
@@ -63,7 +66,14 @@ class SurfaceOptions:
     reach: float = 3.0
     steepest: float = 70.0
     turning: float = 2.0
-    part: bool = False
+    missing: float = 1.0
+    source_looks: bool = True
+    target_looks: bool = True
+
+    @property
+    def both_look(self) -> bool:
+        """Whether either scan may end where the other does."""
+        return self.source_looks and self.target_looks
 
 
 DEFAULTS = SurfaceOptions()
@@ -94,19 +104,61 @@ class Outline(NamedTuple):
         return np.vstack([self.surface.points, self.rim.points])
 
 
+class Guides(NamedTuple):
+    """Points of the source that are known to belong somewhere.
+
+    Attributes:
+        places: (L, 3) where they are; L may be 0.
+        displacement: (L, 3) from there to where they belong.
+        error: standard deviation of each coordinate.
+    """
+
+    places: np.ndarray
+    displacement: np.ndarray
+    error: float
+
+    def observed(self, field: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """As of :class:`_Search`, at these points (L, 3)."""
+        exact = self.error**-2
+        misfit = 0.5 * exact * float(((self.displacement - field) ** 2).sum())
+        precision = np.tile(exact * np.eye(3), (len(field), 1, 1))
+        return exact * self.displacement, precision, misfit
+
+
+NO_GUIDES = Guides(np.zeros((0, 3)), np.zeros((0, 3)), 1.0)
+
+
+class Coverage(NamedTuple):
+    """Which points of one scan come to lie on the other.
+
+    Attributes:
+        met: (N,) bool, points on the other's surface.
+        beyond: (N,) bool, points past the place where the other ends, so that it cannot show them.
+    """
+
+    met: np.ndarray
+    beyond: np.ndarray
+
+    @property
+    def unmet(self) -> float:
+        """Share of the points that are neither."""
+        return 1 - float((self.met | self.beyond).mean())
+
+
 class OnSurface(NamedTuple):
     """What was found between two surfaces.
 
     Attributes:
         posterior: of the last round.
         improbability: −log of its evidence: misfit + energy + complexity.
-        unmet: shares of the source's and of the target's points that lie on no surface of the
-            other.
+        source: which of the source's points lie on the target.
+        target: which of the target's points, of those that look for the source, lie on it.
     """
 
     posterior: Posterior
     improbability: float
-    unmet: tuple[float, float]
+    source: Coverage
+    target: Coverage
 
 
 def refine_on_surface(
@@ -115,6 +167,7 @@ def refine_on_surface(
     starts: Sequence[np.ndarray],
     prior: LinearGaussian,
     options: SurfaceOptions = DEFAULTS,
+    guides: Guides = NO_GUIDES,
 ) -> OnSurface:
     """The field after some rounds.
 
@@ -126,15 +179,16 @@ def refine_on_surface(
     Args:
         source: points spread evenly.
         target: points, as many as there are time for.
-        starts: fields (N + E, 3) to start from, at the source's places.
+        starts: fields (N + E + L, 3) to start from, at the source's places and then the guides'.
         prior: of fields there.
         options: how many rounds, and of what.
+        guides: observed as they are, in every round.
     """
     # Neither noise nor what planes through neighbours miss of a curved surface is to be followed.
     rough = float(np.median(fitted_planes(target.surface.points)[1]))
     last = max(options.last, rough)
     between = max(options.between, last)
-    search = _Search(source, target, options, _LOOKING)
+    search = _Search(source, target, options, _LOOKING, guides)
     search.tell_sides(starts[0])
     # Small systems, for which many threads only wait for each other.
     with threadpool_limits(1, user_api="blas"):
@@ -146,7 +200,7 @@ def refine_on_surface(
         if misfit < improbability:
             still = np.einsum("nab,nb->na", precision, prior.mean)
             end, improbability = Posterior(prior, still, precision), misfit
-    return OnSurface(end, improbability, search.unmet(end.mean, last))
+    return OnSurface(end, improbability, *search.coverage(end.mean, last))
 
 
 def _fields(
@@ -157,8 +211,9 @@ def _fields(
     prior: LinearGaussian,
     between: float,
 ) -> Iterator[tuple[np.ndarray, float]]:
-    """Fields (N + E, 3) down to some standard deviation, on fewer points, and their energies."""
+    """Fields (N + E + L, 3) down to some standard deviation, on fewer points; their energies."""
     rank, count = _FEWER_COLUMNS, len(source.surface.points)
+    guided = np.arange(len(source.places), len(prior.mean))
     inside = evenly(source.surface.points, _FEWER_POINTS)
     rim = np.arange(0, len(source.rim.points), 2)
     few = _Search(
@@ -166,9 +221,10 @@ def _fields(
         Outline(target.surface.at(spread(len(target.surface.points), _FEWER_TARGETS)), target.rim),
         search.options,
         _FEWER_LOOKING,
+        search.guides,
     )
     few.signs = search.signs
-    rows = np.concatenate([inside, count + rim])
+    rows = np.concatenate([inside, count + rim, guided])
     # A pivoted root's first columns are a root of lower rank.
     less = LinearGaussian(prior.mean[rows], prior.modes[:, rows], prior.kernel[rows, :rank])
     for first in search.options.firsts:
@@ -195,8 +251,16 @@ def spread(count: int, some: int) -> np.ndarray:
 class _Search:
     """Finds what the target says of a field's points."""
 
-    def __init__(self, source: Outline, target: Outline, options: SurfaceOptions, looking: int):
+    def __init__(
+        self,
+        source: Outline,
+        target: Outline,
+        options: SurfaceOptions,
+        looking: int,
+        guides: Guides,
+    ):
         """At most ``looking`` target points look for the source."""
+        self.guides = guides
         self.source, self.target, self.options = source.surface, target.surface, options
         self.rims = _Rims(source.rim, target.rim, options)
         self.normals = MovingNormals(self.source)
@@ -208,7 +272,7 @@ class _Search:
     def posterior(
         self, field: np.ndarray, prior: LinearGaussian, schedule: np.ndarray
     ) -> Posterior:
-        """From a field (N + E, 3), the last posterior of a schedule of standard deviations."""
+        """From a field (N + E + L, 3), the last posterior of a schedule of standard deviations."""
         for deviation in schedule:
             posterior = Posterior(prior, *self.observed(field, deviation)[:2])
             field = posterior.mean
@@ -227,14 +291,18 @@ class _Search:
             self.signs = (-1.0,)
 
     def observed(self, field: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """For each source place the sums of precision · displacement (N + E, 3) and of precisions
-        (N + E, 3, 3) over its matches, and how badly the field (N + E, 3) explains these: −log of
-        their density up to a constant."""
+        """For each source place the sums of precision · displacement (N + E + L, 3) and of
+        precisions (N + E + L, 3, 3) over its matches, and how badly the field (N + E + L, 3)
+        explains these: −log of their density up to a constant."""
         count = len(self.source.points)
-        inside = self._on_surface(field[:count], deviation)
-        rim = self.rims.observed(field[count:], deviation)
-        pulled, precision = (np.concatenate(both) for both in zip(inside[:2], rim[:2], strict=True))
-        return pulled, precision, inside[2] + rim[2]
+        ends = len(field) - len(self.guides.places)
+        pulled, precision, misfit = zip(
+            self._on_surface(field[:count], deviation),
+            self.rims.observed(field[count:ends], deviation),
+            self.guides.observed(field[ends:]),
+            strict=True,
+        )
+        return np.concatenate(pulled), np.concatenate(precision), sum(misfit)
 
     def _on_surface(
         self, field: np.ndarray, deviation: float
@@ -246,16 +314,16 @@ class _Search:
         index, matched, ours = self._matches(moved, options.turning * deviation)
         offset, normal, squared, agreeing = self._apart(moved, index, matched, ours)
         squared /= (options.reach * deviation) ** 2
-        if options.part:
-            agreeing[:count] = False
+        agreeing[:count] &= options.source_looks
+        agreeing[count:] &= options.target_looks
         # What lies beyond the end of a surface finds its rim, wherever it belongs.
-        agreeing &= ~np.concatenate(
-            [self.target.rim[matched[:count]], self.source.rim[index[count:]]]
-        )
+        beyond = np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
+        agreeing &= ~beyond
         # As much weight for the target's points as for the source's.
         scale = np.ones(len(index))
         scale[count:] = count / len(self.asking)
-        unexplained = np.where(agreeing, squared / (1 + squared), 1.0)
+        unexplained = np.where(beyond, options.missing, 1.0)
+        unexplained[agreeing] = (squared / (1 + squared))[agreeing]
         misfit = 0.5 * options.reach**2 * float((scale * unexplained).sum())
 
         along = options.along * scale * agreeing / (1 + squared) ** 2
@@ -292,14 +360,16 @@ class _Search:
         agreeing = np.einsum("nc,nc->n", ours, theirs) > self.least
         return offset, normal, across**2 + beside**2, agreeing
 
-    def unmet(self, field: np.ndarray, deviation: float) -> tuple[float, float]:
-        """Shares of source and target points that the field (N + E, 3) brings to no match."""
+    def coverage(self, field: np.ndarray, deviation: float) -> tuple[Coverage, Coverage]:
+        """Which points of the source and of the target a field (N + E + L, 3) brings together."""
         count = len(self.source.points)
         moved = self.source.points + field[:count]
         index, matched, ours = self._matches(moved, self.options.turning * deviation)
         _, _, squared, agreeing = self._apart(moved, index, matched, ours)
         met = agreeing & (squared < (self.options.reach * deviation) ** 2)
-        return 1 - float(met[:count].mean()), 1 - float(met[count:].mean())
+        ends = np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
+        sides = slice(count), slice(count, None)
+        return tuple(Coverage(met[side], ends[side] & ~met[side]) for side in sides)
 
     def _matches(
         self, moved: np.ndarray, turning: float
@@ -341,8 +411,7 @@ class _Rims:
     def __init__(self, source: Curve, target: Curve, options: SurfaceOptions):
         self.source, self.target, self.options = source, target, options
         self.tree = cKDTree(target.points)
-        none = options.part or not len(target.points) or not len(source.points)
-        self.off = none
+        self.off = not (options.both_look and len(target.points) and len(source.points))
 
     def observed(self, field: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, float]:
         """As of :class:`_Search`, at the rim's points (E, 3)."""
@@ -355,7 +424,7 @@ class _Rims:
         back = cKDTree(moved).query(self.target.points[to])[0]
         squared = away**2 / (options.reach * deviation) ** 2
         known = away <= 2 * back + deviation
-        unexplained = np.where(known, squared / (1 + squared), 1.0)
+        unexplained = np.where(known, squared / (1 + squared), options.missing)
         misfit = 0.5 * options.reach**2 * float(unexplained.sum())
         weight = known / (1 + squared) ** 2
         tangent = self.target.tangents[to]

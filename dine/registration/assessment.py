@@ -79,12 +79,12 @@ def measure(
     expected: ExpectedError | None,
 ) -> Measures:
     """Distances on dense points, values of the field as a calibration knows them, and checks."""
-    partial = settings.partial
+    shown = correspondence.shown
     source, target = dense_points(pair.source), dense_points(pair.target)
-    aligned = surface_distance(pair.alignment.align(source), target, partial=partial)
-    after = surface_distance(motion(source), target, partial=partial)
+    aligned = surface_distance(pair.alignment.align(source), target, shown=shown)
+    after = surface_distance(motion(source), target, shown=shown)
     # Points alone cannot tell a small motion from where they happened to be drawn.
-    surfaces = settings.surfaces and not partial
+    surfaces = settings.surfaces and min(shown) > 0
     floor = _spacing(source) + _spacing(target) if surfaces else 0.0
     checks = {"remaining": _remaining(aligned["chamfer"], after["chamfer"], floor)}
     if correspondence.inconsistency is not None:
@@ -99,8 +99,8 @@ def measure(
     # Where points come in another order than the prior's, it says nothing of their field.
     prior = model.prior if model.convention != "none" else None
     start, field, goal = correspondence.start, correspondence.field, correspondence.goal
-    values = field_values(start, field, goal, prior, partial=partial)
-    before = surface_distance(source, target, partial=partial)
+    values = field_values(start, field, goal, prior, shown=shown)
+    before = surface_distance(source, target, shown=shown)
     return Measures(before, aligned, after, values, checks)
 
 
@@ -137,6 +137,7 @@ def assess(
     *,
     checks: Mapping[str, float] | None = None,
     notes: tuple[str, ...] = (),
+    remarks: tuple[str, ...] = (),
 ) -> Trust:
     """Compare values of a result (normalised frame, names as in the calibration) with the rest.
 
@@ -146,6 +147,8 @@ def assess(
     ``unsure``, the mean expected error (normalised); ``unmet``, the share of the surface that lies
     on none of the other scan's; ``inconsistency``, how far points end up from where they began
     (mean, normalised) when registered to the target and back.
+
+    ``notes`` speak against the result, ``remarks`` do not.
     """
     reasons = [*notes, *_from_checks(checks or {})]
     percentiles: dict[str, float] = {}
@@ -168,7 +171,7 @@ def assess(
         verdict = IMPLAUSIBLE
     else:
         verdict = DOUBTFUL if reasons else GOOD
-    return Trust(verdict, tuple(reasons), percentiles, expected_error)
+    return Trust(verdict, (*reasons, *remarks), percentiles, expected_error)
 
 
 def _from_checks(checks: Mapping[str, float]) -> list[str]:

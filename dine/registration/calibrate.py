@@ -25,7 +25,7 @@ from dine.progress import Progress
 from dine.refinement.refine import ROUNDS
 from dine.registration.calibration import Calibration, field_values
 from dine.registration.correspondence import correspond, one_way
-from dine.registration.types import Model, Pair, Settings
+from dine.registration.types import Model, Overlap, Pair, Settings
 
 _BINS = 20
 _LIKELY = 90
@@ -115,7 +115,9 @@ def _measure(
     spreads, errors = [], []
     reference: dict[str, list[float]] = {}
     here = Alignment(np.eye(4), Frame(np.zeros(3), 1.0))
-    settings = Settings("off", ROUNDS, False, pairs.source.shape[1], 0, device, surfaces=True)
+    settings = Settings(
+        "off", ROUNDS, Overlap.AUTO, pairs.source.shape[1], 0, device, surfaces=True
+    )
     with Progress(name, len(pairs), unit="pair") as progress:
         for i, surfaces in zip(range(len(pairs)), meshes or repeat(None), strict=False):
             start, truth, goal = (

@@ -100,15 +100,15 @@ def field_values(
     target: np.ndarray,
     prior: Prior | None,
     *,
-    partial: bool = False,
+    shown: tuple[float, float] = (1.0, 1.0),
 ) -> dict[str, float]:
     """Of a field (N, 3) between (N, 3) and (M, 3) points, what a calibration has references for.
 
-    With ``partial`` only the distances from the target count.
+    ``shown`` are the shares of the source and of the target whose distances count.
     """
     values = {
-        "initial": surface_distance(source, target, partial=partial)["chamfer"],
-        "final": surface_distance(source + field, target, partial=partial)["chamfer"],
+        "initial": surface_distance(source, target, shown=shown)["chamfer"],
+        "final": surface_distance(source + field, target, shown=shown)["chamfer"],
         "reach": float(np.linalg.norm(field, axis=1).max()),
         "folding": folding(source, field),
     }

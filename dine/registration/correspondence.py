@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,19 +16,77 @@ from dine.errors import ConfigError, DataError
 from dine.geometry.distance import distances
 from dine.geometry.frame import Frame
 from dine.geometry.interpolation import FittedDisplacement
-from dine.geometry.rigid import Alignment, check_rigid, rigid_alignments
+from dine.geometry.rigid import (
+    Alignment,
+    check_rigid,
+    motion_between,
+    overlapping_alignments,
+    rigid_alignments,
+)
 from dine.geometry.surface import Surface
 from dine.models.backbones import Backbone, marginal_deviation
+from dine.progress import stage
 from dine.refinement.refine import ROUNDS, Observed, Options, refine
 from dine.registration.shapes import FEWEST, drawn
 from dine.registration.surfaces import refined_on_surfaces
-from dine.registration.types import Correspondence, Model, Pair, Settings
+from dine.registration.types import Correspondence, Model, Overlap, Pair, Settings
 
 # A source point is shown by the target if a target point ends up within so many spacings of it.
 _RETURN = 3.0
 # Points that end so close to each other are the same, and the share of such from which all are.
 _SAME = 1e-9
 _SHARED = 0.5
+# Share of a scan without counterpart from which scans are tried as parts that overlap.
+_LACKING = 0.1
+_AS_WELL = 0.02
+# What a less likely alignment must lower the improbability to, where scans overlap.
+_MUCH_BETTER = 0.5
+
+
+def correspondence_of(
+    source: Surface, target: Surface, model: Model, settings: Settings
+) -> tuple[Pair, Correspondence]:
+    """Points of both scans, aligned, and where those of the source belong.
+
+    Raises:
+        DataError: too few points, points on a line, a matrix that is not rigid, or a part that ends
+            up beside the other scan.
+        ConfigError: unusable settings.
+    """
+    _check(settings)
+    pairs = aligned_pairs(source, target, settings, model.convention)
+    found = _most_probable(pairs, model, settings)
+    if settings.overlap is Overlap.AUTO and settings.prealign == "auto" and _lacks(found[1]):
+        settings = replace(settings, overlap=Overlap.BOTH)
+        pairs = aligned_pairs(source, target, settings, model.convention)
+        parts = _most_probable(pairs, model, settings)
+        if parts[1].unmet < found[1].unmet + _AS_WELL:
+            return parts
+    return found
+
+
+def _check(settings: Settings) -> None:
+    rounds = settings.rounds
+    if rounds < 0:
+        raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
+    if settings.overlap is Overlap.BOTH and not (settings.surfaces and rounds):
+        raise ConfigError(
+            "Where each scan shows what the other does not (overlap both), only surfaces tell what "
+            "belongs together; allow surfaces and rounds of refinement."
+        )
+    if settings.guide is not None and not (settings.surfaces and rounds):
+        raise ConfigError(
+            "Landmarks guide the refinement on surfaces only; allow surfaces and rounds of "
+            "refinement."
+        )
+
+
+def _lacks(found: Correspondence) -> bool:
+    """Whether much of the surfaces has no counterpart: more than one scan lacks by a hole."""
+    if found.unmet is None:
+        return False
+    parts = min(found.shown) < 1 - _LACKING and max(found.shown) < 1 - _LACKING / 5
+    return parts or found.unmet > _LACKING
 
 
 def aligned_pairs(
@@ -41,6 +100,7 @@ def aligned_pairs(
         DataError: too few points, points on a line, or a matrix that is not rigid.
         ConfigError: unusable settings.
     """
+    stage("alignment")
     rng = np.random.default_rng([4, settings.seed])
     samples = drawn(source, settings.points, rng, "source")
     seen = drawn(target, settings.points, rng, "target").places(target.vertices)
@@ -62,46 +122,70 @@ def _motions(settings: Settings, source: np.ndarray, target: np.ndarray) -> list
     if how == "off":
         return [np.eye(4)]
     if how == "auto":
-        return rigid_alignments(source, target, partial=settings.partial)
+        if settings.guide is not None and settings.guide.tells_rotation:
+            return [motion_between(settings.guide.here, settings.guide.there)]
+        return _RIGID[settings.overlap](source, target)
     raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
 
 
-def most_probable(
+_RIGID = {
+    Overlap.AUTO: rigid_alignments,
+    Overlap.BOTH: overlapping_alignments,
+    Overlap.TARGET_IN_SOURCE: partial(rigid_alignments, partial=True),
+    # What brings the target onto a part of it, undone.
+    Overlap.SOURCE_IN_TARGET: lambda source, target: [
+        np.linalg.inv(motion) for motion in rigid_alignments(target, source, partial=True)
+    ],
+}
+
+
+def _most_probable(
     pairs: Sequence[Pair], model: Model, settings: Settings
 ) -> tuple[Pair, Correspondence]:
     """Of several alignments the one whose correspondence explains the surfaces best.
 
-    The first where surfaces are not looked at, or little of the source is to be seen.
+    The first where surfaces are not looked at, or little of one scan is to be seen.
     """
     found = [(pairs[0], correspond(pairs[0], model, settings))]
-    if found[0][1].improbability is not None and not settings.partial:
+    symmetric = settings.overlap in (Overlap.AUTO, Overlap.BOTH)
+    if found[0][1].improbability is not None and symmetric:
         found += [(pair, correspond(pair, model, settings)) for pair in pairs[1:]]
-    return min(found, key=lambda one: one[1].improbability or 0.0)
+    if settings.overlap is not Overlap.BOTH:
+        return min(found, key=lambda one: one[1].improbability or 0.0)
+    # Once bent, parts can fit by chance. How they lie says more: the likeliest come first.
+    best = found[0]
+    for one in found[1:]:
+        if one[1].improbability < _MUCH_BETTER * best[1].improbability:
+            best = one
+    return best
 
 
 def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:
     """Where the source's points belong.
 
     Raises:
-        ConfigError: a negative number of rounds.
-        DataError: with ``partial``, the part ends up beside the source.
+        DataError: the target, a part of the source, ends up beside it.
     """
-    rounds = settings.rounds
-    if rounds < 0:
-        raise ConfigError(f"The number of rounds is {rounds}; expected 0 or more.")
     found = _from_points(pair, model, settings)
-    if not (settings.surfaces and rounds):
+    if not (settings.surfaces and settings.rounds):
         return found
     # Scans that hold the same points say of each where it went.
-    if (distances(found.moved, pair.goal) < _SAME).mean() >= _SHARED:
+    if settings.guide is None and (distances(found.moved, pair.goal) < _SAME).mean() >= _SHARED:
         return replace(found, indicator=np.zeros(len(found.start)))
     return refined_on_surfaces(pair, found, settings)
 
 
 def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence:
-    """What the drawn points alone say."""
-    if settings.partial:
+    """What the drawn points alone say; nothing where each scan has some that the other lacks."""
+    if settings.overlap is Overlap.BOTH:
+        return _still(pair)
+    if settings.overlap is Overlap.TARGET_IN_SOURCE:
+        stage("points")
         return _from_part(pair.start, pair.goal, settings.rounds)
+    if settings.overlap is Overlap.SOURCE_IN_TARGET:
+        stage("points")
+        options = Options(settings.rounds, part=True)
+        return replace(_still(pair), field=refine(pair.start, pair.goal, options=options).mean)
     there = one_way(model.backbone, pair.start, pair.goal, settings)
     if settings.surfaces and settings.rounds:
         return there  # surfaces will say more
@@ -110,6 +194,12 @@ def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence
     seen, whole = frame.normalise(pair.goal), frame.normalise(pair.start)
     back = one_way(model.backbone, seen, whole, settings).field * frame.scale
     return replace(there, inconsistency=_inconsistency(there, back))
+
+
+def _still(pair: Pair) -> Correspondence:
+    """No displacement."""
+    start = pair.start
+    return Correspondence(start, pair.goal, np.zeros_like(start), None, np.ones(len(start), bool))
 
 
 def one_way(
@@ -137,6 +227,7 @@ def predict_and_refine(
     that, but grows with how far a point moved, and with how far the network would have moved it
     elsewhere: their sum is taken. How well it ranks errors is among the facts of a calibration.
     """
+    stage("network")
     batch = make_batch([source], [target]).to(device)
     result = backbone.to(device).eval()(batch)
     predicted = result.displacement[0].double().cpu().numpy()
@@ -144,6 +235,7 @@ def predict_and_refine(
     deviation = None if deviation is None else deviation[0].double().cpu().numpy()
     if rounds == 0:
         return predicted, deviation
+    stage("points")
     observed = Observed.of_network(predicted, deviation)
     refined = refine(source, target, observed, options=Options(rounds)).mean
     elsewhere = np.linalg.norm(refined - predicted, axis=1)
@@ -169,7 +261,7 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> Corresponden
     if supported.sum() < FEWEST:
         raise DataError(
             "Hardly any part of the source is found in the target; check that both show the same "
-            "object, or leave out `partial`."
+            "object, or leave the overlap to `auto`."
         )
     return Correspondence(start, goal, FittedDisplacement(places, -back)(start), None, supported)
 

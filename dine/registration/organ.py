@@ -217,7 +217,7 @@ class _Search:
             Outline(fixed, _NO_RIM),
             [mean],
             LinearGaussian(mean, modes, root.root),
-            replace(options, part=self.partial),
+            replace(options, source_looks=not self.partial),
         )
         return OrganField(placed, found.posterior, root, found.improbability)
 
@@ -393,11 +393,12 @@ def _report(
     Raises:
         DataError: little of the scan is anywhere near the moved template.
     """
-    alignment, partial = field.placed.alignment, search.partial
+    alignment = field.placed.alignment
+    shown = (0.0 if search.partial else 1.0, 1.0)
     seen = dense_points(target)
     surfaces = (source, replace(source, vertices=alignment.align(source.vertices)), moved)
     ours = [dense_points(surface) for surface in surfaces]
-    before, aligned, after = (surface_distance(x, seen, partial=partial) for x in ours)
+    before, aligned, after = (surface_distance(x, seen, shown=shown) for x in ours)
     apart = distances(seen, ours[2]) / alignment.frame.scale
     if (apart < _NEAR).mean() < _SHOWN:
         raise DataError(

@@ -18,7 +18,7 @@ from dine.models.devices import chosen_device
 from dine.progress import stage
 from dine.refinement.refine import ROUNDS
 from dine.registration.assessment import Measures, assess, expected_error, measure
-from dine.registration.correspondence import aligned_pairs, most_probable
+from dine.registration.correspondence import correspondence_of
 from dine.registration.model import load_model
 from dine.registration.shapes import (
     POINTS,
@@ -31,13 +31,18 @@ from dine.registration.shapes import (
 )
 from dine.registration.types import (
     Correspondence,
+    Guide,
     Model,
     Motion,
+    Overlap,
     Pair,
     RegistrationResult,
     Settings,
     Trust,
 )
+
+# Share of the source without counterpart that is more than a rim.
+_WORTH_SAYING = 0.02
 
 if TYPE_CHECKING:
     from dine.priors.organ import OrganPrior
@@ -51,8 +56,11 @@ def register(
     prealign: str | np.ndarray = "auto",
     apply: Mapping[str, Shape] | None = None,
     landmarks: tuple[Points, Points] | None = None,
+    guide: tuple[Points, Points] | None = None,
+    guide_error: float | None = None,
     rounds: int = ROUNDS,
     surfaces: bool = True,
+    overlap: str = "auto",
     partial: bool = False,
     points: int = POINTS,
     seed: int = 0,
@@ -74,11 +82,17 @@ def register(
         apply: further shapes in the source's frame to move along, by name.
         landmarks: corresponding (L, 3) points of source and target, or files of them, to measure
             with only.
+        guide: likewise, to keep to: points that belong together, and to align by if they tell how.
+        guide_error: standard deviation of each of their coordinates, in the units of the source; by
+            default a hundredth of its radius.
         rounds: of refinement at test time (most probable smooth field); 0 for the network's own.
         surfaces: go on from the points to the surfaces that they were drawn on (meshes), or to all
             points (clouds); not without rounds.
-        partial: the target shows a part of the source only. Regions without counterpart follow the
-            others instead of being pulled onto the part.
+        overlap: which part of the object each scan shows. ``auto``: the same, or parts that overlap
+            if that leaves much without counterpart; ``target-in-source`` and ``source-in-target``:
+            one shows a part of the other; ``both``: each shows what the other does not. Regions
+            without counterpart follow the others instead of being pulled onto the part.
+        partial: the same as ``overlap="target-in-source"``.
         points: points that the network sees; it was trained with 1024.
         seed: of the draws.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -90,13 +104,33 @@ def register(
         DataError: unreadable or unusable shapes, such as points on a line, or of other sizes.
         ConfigError: unusable settings.
     """
+    chosen = _overlap(overlap, partial)
     if prior is not None:
+        if chosen not in (Overlap.AUTO, Overlap.TARGET_IN_SOURCE):
+            raise ConfigError(
+                f"With the prior of an organ the overlap is {chosen}; expected auto or "
+                "target-in-source, since the template is whole."
+            )
         network = {"model": model, "surfaces": not surfaces}
         network |= {"rounds": rounds != ROUNDS, "points": points != POINTS}
+        network |= {"guide": guide is not None}
         _refuse_network(network)
+        partial = chosen is Overlap.TARGET_IN_SOURCE
         return _with_prior(source, target, prior, (prealign, partial, seed), apply or {}, landmarks)
-    settings = Settings(prealign, rounds, partial, points, seed, chosen_device(device), surfaces)
+    source, target = as_surface(source, "source"), as_surface(target, "target")
+    kept = guide and Guide(*checked_landmarks(guide, source, target), guide_error)
+    device = chosen_device(device)
+    settings = Settings(prealign, rounds, chosen, points, seed, device, surfaces, kept)
     return _registered(source, target, model, settings, apply or {}, landmarks)
+
+
+def _overlap(name: str, partial: bool) -> Overlap:
+    chosen = Overlap.of(name)
+    if not partial:
+        return chosen
+    if chosen not in (Overlap.AUTO, Overlap.TARGET_IN_SOURCE):
+        raise ConfigError(f"The overlap is {chosen}, which is not partial; leave out one of both.")
+    return Overlap.TARGET_IN_SOURCE
 
 
 def _with_prior(
@@ -133,8 +167,8 @@ def _refuse_network(chosen: Mapping[str, Any]) -> None:
 
 
 def _registered(
-    source: Shape,
-    target: Shape,
+    source: Surface,
+    target: Surface,
     model: Model | None,
     settings: Settings,
     apply: Mapping[str, Shape],
@@ -143,13 +177,11 @@ def _registered(
     began = time.perf_counter()
     stage("reading")
     model = model or load_model()
-    source, target = as_surface(source, "source"), as_surface(target, "target")
     further = {name: as_surface(shape, name) for name, shape in apply.items()}
     marks = None if landmarks is None else checked_landmarks(landmarks, source, target)
     check_spaces(source, (target, *further.values()))
-    notes = check_sizes(source, target, settings.partial)
-    pair, correspondence = _corresponding(source, target, model, settings)
-    notes += _support(correspondence)
+    notes = check_sizes(source, target, settings.overlap is not Overlap.AUTO)
+    pair, correspondence = correspondence_of(source, target, model, settings)
     stage("measures")
 
     motion = Motion(pair.alignment, correspondence.interpolated())
@@ -164,6 +196,7 @@ def _registered(
         expected and expected.mean,
         checks=measures.checks,
         notes=tuple(notes),
+        remarks=_support(correspondence),
     )
     report = _report(pair, correspondence, displacement, measures, trust, model)
     report["settings"] = settings.described(len(pair.start))
@@ -189,35 +222,13 @@ def _registered(
     )
 
 
-def _corresponding(
-    source: Surface, target: Surface, model: Model, settings: Settings
-) -> tuple[Pair, Correspondence]:
-    """The alignment and what it leads to, stage by stage."""
-    later = "points and surfaces" if settings.surfaces and settings.rounds else "points"
-    stage("alignment")
-    pairs = aligned_pairs(source, target, settings, model.convention)
-    if settings.partial:  # without the network, which each alignment begins with otherwise
-        stage(later)
-    hooks = [
-        model.backbone.register_forward_pre_hook(lambda *_: stage("network")),
-        model.backbone.register_forward_hook(lambda *_: stage(later)),
-    ]
-    try:
-        return most_probable(pairs, model, settings)
-    finally:
-        for hook in hooks:
-            hook.remove()
-
-
-def _support(correspondence: Correspondence) -> list[str]:
+def _support(correspondence: Correspondence) -> tuple[str, ...]:
     """What to say of source points that the target does not show."""
-    lacking = ~correspondence.supported
-    if not lacking.any():
-        return []
-    return [
-        f"{100 * lacking.mean():.0f} % of the source has no counterpart in the target "
-        "and follows the rest."
-    ]
+    lacking = 1 - correspondence.supported.mean()
+    if lacking < _WORTH_SAYING:
+        return ()
+    share = f"{100 * lacking:.0f} % of the source"
+    return (f"{share} has no counterpart in the target and follows the rest.",)
 
 
 def _report(

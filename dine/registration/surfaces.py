@@ -21,10 +21,17 @@ from dine.geometry.oriented import (
 )
 from dine.geometry.surface import Surface
 from dine.priors.gaussian import CovarianceRoot, LinearGaussian, Posterior
-from dine.refinement.process import SURFACE
-from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
+from dine.progress import stage
+from dine.refinement.process import STIFFER, SURFACE
+from dine.refinement.surface import (
+    NO_GUIDES,
+    OnSurface,
+    Outline,
+    SurfaceOptions,
+    refine_on_surface,
+)
 from dine.registration.shapes import near_points
-from dine.registration.types import Correspondence, Pair, Settings
+from dine.registration.types import Correspondence, Overlap, Pair, Settings
 
 SOURCE_POINTS = 2000
 TARGET_POINTS = 20_000
@@ -32,6 +39,10 @@ TARGET_POINTS = 20_000
 _DRAWN = 4
 # Error of a coarse field, which a start that the process allows is fitted to.
 _COARSE_ERROR = 0.01
+# Where scans overlap: what points beyond the other's end cost, against others without counterpart,
+# and how the first, stiff field is found.
+_MISSING = 0.2
+_ROUGHLY = {"last": 0.05, "between": 0.05, "firsts": (0.2, 0.1), "rounds": 15}
 # Points through which a plane is laid to see how rough a mesh is, and the cosine between planes and
 # faces below which its faces are not followed: 20 degrees.
 _SMOOTHED = 24
@@ -94,6 +105,7 @@ def rim_of(surface: Surface, spacing: float) -> Curve:
 
 def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -> Correspondence:
     """What was found between points, refined between the surfaces that they were drawn on."""
+    stage("surfaces")
     rng = np.random.default_rng([7, settings.seed])
     source, target = (
         replace(surface, vertices=normalise(surface.vertices))
@@ -107,24 +119,61 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     spacing = float(np.median(cKDTree(drawn.points).query(drawn.points, k=2)[0][:, 1]))
     moving = Outline(drawn, rim_of(source, spacing))
     fixed = Outline(oriented_points(target, TARGET_POINTS, rng), rim_of(target, spacing / 4))
-    root = SURFACE.fitted(moving.places)
+    guides = settings.guide.within(pair.alignment) if settings.guide else NO_GUIDES
+    places = np.vstack([moving.places, guides.places])
+    root = SURFACE.fitted(places)
     prior = LinearGaussian.of_kernel(root.root)
-    start = ProcessField(root, _fitted(root, found.start, found.field))
-    starts = [start(moving.places), np.zeros_like(moving.places)]
-    options = SurfaceOptions(part=settings.partial)
-    posterior, improbability, unmet = refine_on_surface(moving, fixed, starts, prior, options)
+    starts = [np.zeros_like(places)]
+    if found.field.any():
+        start = ProcessField(root, _fitted(root, found.start, found.field))
+        starts.insert(0, start(places))
+    options = _options(settings.overlap)
+    if settings.overlap is Overlap.BOTH:
+        # Of parts, a loose field would make wholes of each other: first, one that hardly bends.
+        stiff = LinearGaussian.of_kernel(STIFFER.fitted(places).root)
+        rough = refine_on_surface(
+            moving, fixed, starts, stiff, replace(options, **_ROUGHLY), guides
+        )
+        start = ProcessField(root, _fitted(root, places, rough.posterior.mean))
+        starts.insert(0, start(places))
+    end = refine_on_surface(moving, fixed, starts, prior, options, guides)
+    posterior = end.posterior
     anywhere = ProcessField(root, posterior.alone)
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
+    unmet, shown, lacking = _covered(end, settings.overlap)
+    nearest = cKDTree(drawn.points).query(found.start)[1]
     return replace(
         found,
         field=anywhere(found.start),
         anywhere=anywhere,
         indicator=deviation,
-        improbability=improbability,
-        # Of a part, and of what it is a part of, one side lacks much, but not the other.
-        unmet=unmet[1] if settings.partial else min(unmet),
+        improbability=end.improbability,
+        unmet=unmet,
+        shown=shown,
+        supported=~lacking[nearest],
     )
+
+
+def _options(overlap: Overlap) -> SurfaceOptions:
+    return SurfaceOptions(
+        missing=_MISSING if overlap is Overlap.BOTH else 1.0,
+        source_looks=overlap is not Overlap.TARGET_IN_SOURCE,
+        target_looks=overlap is not Overlap.SOURCE_IN_TARGET,
+    )
+
+
+def _covered(end: OnSurface, overlap: Overlap) -> tuple[float, tuple[float, float], np.ndarray]:
+    """Of what was found, the share that should lie on the other scan and does not, the shares of
+    both scans that the other shows, and the source points (N,) that the target does not show."""
+    source, target = end.source, end.target
+    if overlap is Overlap.TARGET_IN_SOURCE:
+        return target.unmet, (0.0, 1.0), ~source.met
+    if overlap is Overlap.SOURCE_IN_TARGET:
+        return source.unmet, (1.0, 0.0), np.zeros(len(source.met), bool)
+    shown = tuple(1 - float(side.beyond.mean()) for side in (source, target))
+    # What one scan lacks by a hole, the other does not.
+    return min(source.unmet, target.unmet), shown, source.beyond
 
 
 def _fitted(root: CovarianceRoot, places: np.ndarray, field: np.ndarray) -> np.ndarray:

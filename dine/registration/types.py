@@ -4,22 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from dine.errors import ConfigError
 from dine.geometry.distance import distances
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.rigid import Alignment
 from dine.geometry.surface import Surface
+from dine.refinement.surface import Guides
 from dine.registration.calibration import Calibration
 from dine.registration.objects import is_object
 from dine.registration.shapes import Shape, as_surface, checked_points, dense_points
 
 if TYPE_CHECKING:
     from dine.registration.grid import DisplacementGrid
+
+# Share of the largest extent of landmarks that the second has at least, to align by them.
+_CLEARLY = 0.1
 
 
 @dataclass(frozen=True)
@@ -40,10 +46,72 @@ class Model:
 
     def calibration_for(self, settings: Settings) -> Calibration | None:
         """The calibration where it applies: to whole targets, refined as it was made with."""
-        if self.calibration is None or settings.partial:
+        if self.calibration is None or settings.overlap is not Overlap.AUTO:
             return None
         made = (self.calibration.facts.get("rounds"), self.calibration.facts.get("surfaces", False))
         return self.calibration if made == (settings.rounds, settings.surfaces) else None
+
+
+class Overlap(StrEnum):
+    """Which part of the object each scan shows."""
+
+    AUTO = "auto"
+    """Both the same; or, where that leaves much without counterpart, parts that overlap."""
+    BOTH = "both"
+    """Parts that overlap: each scan shows what the other does not."""
+    SOURCE_IN_TARGET = "source-in-target"
+    TARGET_IN_SOURCE = "target-in-source"
+
+    @classmethod
+    def of(cls, name: str) -> Overlap:
+        """By name.
+
+        Raises:
+            ConfigError: another name.
+        """
+        try:
+            return cls(name)
+        except ValueError:
+            raise ConfigError(
+                f"The overlap is {name!r}; expected one of {', '.join(cls)}."
+            ) from None
+
+
+@dataclass(frozen=True)
+class Guide:
+    """Corresponding places that a registration is to keep to.
+
+    Attributes:
+        here: (L, 3) in the source's coordinates.
+        there: (L, 3) in the target's.
+        error: standard deviation of each coordinate, in the units of the source; None for a
+            hundredth of its radius.
+    """
+
+    here: np.ndarray
+    there: np.ndarray
+    error: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.error is not None and not 0 < self.error < float("inf"):
+            raise ConfigError(f"The error of the guiding landmarks is {self.error}; expected > 0.")
+
+    @property
+    def tells_rotation(self) -> bool:
+        """Whether the places are enough, and far enough from a line, to align by."""
+        return min(_widths(self.here), _widths(self.there)) > _CLEARLY
+
+    def within(self, alignment: Alignment) -> Guides:
+        """In the normalised frame."""
+        places = alignment.normalise(self.here)
+        error = 0.01 if self.error is None else self.error / alignment.frame.scale
+        return Guides(places, alignment.frame.normalise(self.there) - places, error)
+
+
+def _widths(points: np.ndarray) -> float:
+    """Second largest extent of (L, 3) points as a share of the largest."""
+    widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(widths[1] / widths[0]) if len(widths) > 1 and widths[0] > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -52,22 +120,24 @@ class Settings:
 
     prealign: str | np.ndarray
     rounds: int
-    partial: bool
+    overlap: Overlap
     points: int
     seed: int
     device: torch.device
     surfaces: bool = True
+    guide: Guide | None = None
 
     def described(self, points: int) -> dict[str, Any]:
         """For the report; ``points`` were drawn."""
         return {
             "rounds": self.rounds,
             "surfaces": self.surfaces,
-            "partial": self.partial,
+            "overlap": str(self.overlap),
             "points": points,
             "seed": self.seed,
             "prealign": self.prealign if isinstance(self.prealign, str) else "given",
             "device": str(self.device),
+            "guides": 0 if self.guide is None else len(self.guide.here),
         }
 
 
@@ -109,8 +179,10 @@ class Correspondence:
             known at ``start`` only.
         improbability: −log of the evidence of the surfaces, up to a constant of the two scans; None
             where only points were looked at.
-        unmet: share of the surface, of the scan that lacks less, that lies on none of the other;
-            None where only points were looked at.
+        unmet: share of the surface, of the scan that lacks less, that lies on none of the other,
+            although this goes on there; None where only points were looked at.
+        shown: shares of the source and of the target that the other shows; 0 where it is not known
+            to.
     """
 
     start: np.ndarray
@@ -122,6 +194,7 @@ class Correspondence:
     anywhere: Callable[[np.ndarray], np.ndarray] | None = None
     improbability: float | None = None
     unmet: float | None = None
+    shown: tuple[float, float] = (1.0, 1.0)
 
     def interpolated(self) -> Callable[[np.ndarray], np.ndarray]:
         """The field as a function of (M, 3) places, normalised frame."""
@@ -202,7 +275,7 @@ class RegistrationResult:
         points: (n, 3) sampled source points that the network saw, where they are in the source.
         point_displacement: (n, 3) of these.
         point_uncertainty: (n,) of these, or None.
-        supported: (n,) bool, points that the target shows; all, unless ``partial``.
+        supported: (n,) bool, points that the target shows.
         trust: how far to trust the result.
         report: everything that the JSON report says.
         alignment: of the source to the target, and the normalised frame there.

@@ -167,7 +167,7 @@ def test_surface_distance_is_what_its_names_say():
     assert found["hausdorff"] == pytest.approx(max(there.max(), back.max()))
     expected = max(np.percentile(there, 95), np.percentile(back, 95))
     assert found["hd95"] == pytest.approx(expected)
-    assert surface_distance(a, b, partial=True)["chamfer"] == pytest.approx((back**2).mean())
+    assert surface_distance(a, b, shown=(0, 1))["chamfer"] == pytest.approx((back**2).mean())
 
 
 def test_folding_is_the_share_turned_inside_out():
@@ -484,7 +484,7 @@ def test_vertices_without_faces_take_no_part(pair, result, kind):
 
 
 def test_landmarks_are_checked_before_anything_is_computed(pair, monkeypatch):
-    monkeypatch.setattr(register_module, "aligned_pairs", lambda *args: pytest.fail("computed"))
+    monkeypatch.setattr(register_module, "correspondence_of", lambda *args: pytest.fail("computed"))
     points = pair[0].vertices[:5]
     for marks in ((points, points[:4]), (points[:, :2], points[:, :2])):
         with pytest.raises(DataError, match="expected as many rows of three coordinates"):
@@ -573,7 +573,7 @@ def test_command_tells_programs_and_the_log(files, tmp_path):
     written = {Path(place) for place in (*places, *told["files"]["applied"].values())}
     assert written == set(tmp_path.glob("moved.*"))
     lines = log.read_text().splitlines()
-    stages = ["reading", "alignment", "network", "points and surfaces", "measures", "writing"]
+    stages = ["reading", "alignment", "network", "points", "surfaces", "measures", "writing"]
     said = [line.split(" ", 1)[1] for line in lines]
     assert [name for name in dict.fromkeys(said) if name in stages] == stages
     assert any(line.startswith(f"{out}: HD95 ") for line in said)
@@ -612,7 +612,7 @@ def test_command_keeps_what_is_known_of_vertices(files, tmp_path, pair):
 
 
 def test_command_probes_its_output_first(files, tmp_path, monkeypatch):
-    monkeypatch.setattr(register_module, "aligned_pairs", lambda *args: pytest.fail("computed"))
+    monkeypatch.setattr(register_module, "correspondence_of", lambda *args: pytest.fail("computed"))
     (tmp_path / "afile").write_text("precious")
     np.savetxt(tmp_path / "cloud.xyz", organ().vertices)
     for source, out, said in (

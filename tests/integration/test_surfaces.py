@@ -8,6 +8,7 @@ from click.testing import CliRunner
 import dine
 from dine.cli import cli
 from dine.data.sampling import sample_surface
+from dine.errors import ConfigError
 from dine.files import read_json
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
@@ -87,6 +88,84 @@ def test_a_part_of_the_target_pulls_at_what_it_shows_only(pair):
     coarse = dine.register(source, shown, **settings, surfaces=False)
     fine = dine.register(source, shown, **settings)
     assert mean_error(fine.moved.vertices, truth) < mean_error(coarse.moved.vertices, truth)
+
+
+def cut(surface, kept):
+    """The faces (F,) alone, and the vertices that remain."""
+    used, index = np.unique(surface.faces[kept], return_inverse=True)
+    return Surface(surface.vertices[used], index.reshape(-1, 3)), used
+
+
+@pytest.fixture(scope="module")
+def overlapping(pair):
+    """Parts of both, each without a fifth of the other's, turned; where the source's vertices
+    belong, and which of them the target shows."""
+    source, target, truth = pair
+    along, there = (x.vertices[x.faces].mean(axis=1)[:, 0] for x in (source, target))
+    ours, used = cut(source, along < np.quantile(along, 0.8))
+    theirs, _ = cut(target, there > np.quantile(there, 0.2))
+    seen = truth[used, 0] > theirs.vertices[:, 0].min()
+    turn = trimesh.transformations.rotation_matrix(np.radians(35), [0.2, 1, 0.4], [1, 2, 0])
+    turned = Surface(theirs.vertices @ turn[:3, :3].T + turn[:3, 3], theirs.faces)
+    return ours, turned, truth[used] @ turn[:3, :3].T + turn[:3, 3], seen
+
+
+@pytest.mark.parametrize("overlap", ["auto", "both"])
+def test_parts_that_overlap_come_to_lie_on_each_other(overlapping, overlap):
+    source, target, truth, seen = overlapping
+    result = dine.register(source, target, overlap=overlap)
+    assert mean_error(result.moved.vertices[seen], truth[seen]) < 0.03
+    assert 0.6 < result.report["supported"] < 0.9
+    assert "no counterpart" in " ".join(result.trust.reasons)
+    assert result.report["settings"]["overlap"] == overlap
+
+
+def test_a_source_that_is_a_part_of_its_target(pair):
+    source, target, truth = pair
+    along = source.vertices[source.faces].mean(axis=1)[:, 0]
+    part, used = cut(source, along < np.quantile(along, 0.6))
+    result = dine.register(part, target, overlap="source-in-target")
+    assert mean_error(result.moved.vertices, truth[used]) < 0.03
+    assert result.report["supported"] == 1
+
+
+def test_landmarks_guide_where_surfaces_leave_it_open():
+    """A spheroid turned about its axis has the same surface as before."""
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    source = Surface(np.asarray(ball.vertices) * [30.0, 20.0, 20.0], np.asarray(ball.faces))
+    turn = trimesh.transformations.rotation_matrix(np.radians(25), [1, 0, 0])[:3, :3]
+    truth = source.vertices @ turn.T
+    target = Surface(truth[:, [0, 2, 1]] * [1, 1, -1], source.faces)  # other vertices
+    marked = np.argsort(source.vertices[:, 0])[len(truth) // 2 :: 60]
+    guide = (source.vertices[marked], truth[marked])
+    settings = {"prealign": "off", "guide": guide, "guide_error": 0.3}
+    guided = dine.register(source, target, **settings)
+    free = dine.register(source, target, prealign="off")
+    assert mean_error(guided.moved.vertices, truth) < 2.5
+    assert mean_error(free.moved.vertices, truth) > 5
+    assert guided.report["settings"]["guides"] == len(marked)
+    # Enough of them say how the source lies, too.
+    aligned = dine.register(source, target, guide=guide)
+    assert mean_error(aligned.alignment.align(source.vertices), truth) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"overlap": "some"}, "The overlap is 'some'; expected one of auto, both"),
+        ({"overlap": "both", "partial": True}, "The overlap is both, which is not partial"),
+        ({"overlap": "both", "surfaces": False}, "only surfaces tell what belongs together"),
+        ({"overlap": "both", "rounds": 0}, "only surfaces tell what belongs together"),
+        ({"guide": (np.eye(3), np.eye(3)), "surfaces": False}, "Landmarks guide the refinement"),
+        ({"guide": (np.eye(3), np.eye(3)), "guide_error": 0.0}, "error of the guiding landmarks"),
+        ({"guide": (np.eye(3), np.eye(3)[:2])}, "The landmarks have shapes"),
+        ({"overlap": "both", "prior": "none.prior"}, "expected auto or target-in-source"),
+        ({"guide": (np.eye(3), np.eye(3)), "prior": "none.prior"}, "no network to choose guide"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_refused(pair, settings, said):
+    with pytest.raises(ConfigError, match=said):
+        dine.register(pair[0], pair[1], **settings)
 
 
 def test_scans_that_share_their_points_are_matched_exactly():

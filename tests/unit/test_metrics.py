@@ -39,7 +39,9 @@ def test_distances_to_hand_made_clouds():
     assert found["chamfer_unsquared"] == pytest.approx(1 / 2 + 7 / 3)
     # Of 0, 2 and 5 with linear interpolation; the other direction's is smaller.
     assert found["hd95"] == pytest.approx(2 + 0.9 * 3)
-    assert surface_distance(a, b, partial=True)["chamfer"] == pytest.approx(29 / 3)
+    assert surface_distance(a, b, shown=(0, 1))["chamfer"] == pytest.approx(29 / 3)
+    # The farthest of three target points is not held against the others.
+    assert surface_distance(a, b, shown=(1, 2 / 3))["chamfer"] == pytest.approx(1 / 2 + 4 / 2)
 
 
 def test_hd95_forgives_what_hausdorff_does_not():
