@@ -56,7 +56,8 @@ def correspondence_of(
     _check(settings)
     pairs = aligned_pairs(source, target, settings, model.convention)
     found = _most_probable(pairs, model, settings)
-    if settings.overlap is Overlap.AUTO and settings.prealign == "auto" and _lacks(found[1]):
+    may_lie_otherwise = isinstance(settings.prealign, str) and settings.prealign == "auto"
+    if settings.overlap is Overlap.AUTO and may_lie_otherwise and _lacks(found[1]):
         settings = replace(settings, overlap=Overlap.BOTH)
         pairs = aligned_pairs(source, target, settings, model.convention)
         parts = _most_probable(pairs, model, settings)

@@ -133,6 +133,7 @@ class Settings:
             "rounds": self.rounds,
             "surfaces": self.surfaces,
             "overlap": str(self.overlap),
+            "partial": self.overlap is Overlap.TARGET_IN_SOURCE,
             "points": points,
             "seed": self.seed,
             "prealign": self.prealign if isinstance(self.prealign, str) else "given",
