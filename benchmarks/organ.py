@@ -1,7 +1,7 @@
 """What a prior of one organ says of what a scan does not show: one row a template and method.
 
     python benchmarks/organ.py ../shared/meshes/objects [--deformations 12] [--only liver]
-    python benchmarks/organ.py ../shared/meshes/objects --vary     # share seen, noise, pose
+    python benchmarks/organ.py ../shared/meshes/objects --vary     # one thing at a time changed
     python benchmarks/organ.py ../shared/meshes/objects --edges    # convergence in the element size
 
 Of every template 200 deformations are simulated (``dine simulate``), held about the end of the
@@ -16,7 +16,8 @@ real.
 
 Methods share alignment, matching and schedule, and differ in the prior: a smooth process (that of
 ``dine register --surfaces``), principal components alone, and these with a process for the rest.
-``unregistered`` is the template where it lies, ``rigid`` aligned by closest points.
+``unregistered`` is the template where it lies, ``rigid`` aligned by closest points; ``Bayesian
+CPD`` is :mod:`dine.classical.bcpd` at the settings of the evidence.
 """
 
 from __future__ import annotations
@@ -28,11 +29,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from organ_conditions import conditions
 from organ_truth import SHIFTED, attachment, inside_points, true_field
 from scipy.spatial.transform import Rotation
 
+from dine.classical.methods import CLASSICAL
 from dine.config import OrganLearning, Simulation
 from dine.geometry.frame import Frame
+from dine.geometry.interpolation import FittedDisplacement
+from dine.geometry.oriented import evenly
 from dine.geometry.rigid import rigid_alignment, rigid_alignments, transformed
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
@@ -49,6 +54,8 @@ TEMPLATES = {
     "heart": "organ_heart_biventricle.ply",
 }
 SEEN, NOISE = 0.4, 0.005
+# Points that Bayesian CPD moves.
+FEW = 1000
 
 
 @dataclass(frozen=True)
@@ -121,16 +128,19 @@ def measured(
     return [error[hidden].mean(), seen, target, (error[few] <= bound).mean()]
 
 
-def learned(path: Path, **changes: object) -> tuple[Surface, OrganPrior]:
+def held(template: Surface) -> np.ndarray:
+    """Mask (V,) of the vertices that the middle of what is held may be at."""
+    return np.linalg.norm(template.vertices - attachment(template), axis=1) <= SHIFTED
+
+
+def learned(path: Path) -> tuple[Surface, OrganPrior]:
     """A template in radii, and its prior; the time that took is printed."""
     surface = read_surface(path)
     template = Surface(
         Frame.of(surface.vertices).normalise(surface.vertices), surface.faces, path.name
     )
-    held = np.linalg.norm(template.vertices - attachment(template), axis=1) <= SHIFTED
     began = time.process_time()
-    settings = Simulation(fixed="about", **changes)
-    fields = simulate(template, settings, seed=1, fixed=held)
+    fields = simulate(template, Simulation(fixed="about"), seed=1, fixed=held(template))
     simulated = time.process_time()
     prior = learn(template, [fields], OrganLearning())
     print(
@@ -167,18 +177,26 @@ def results(
 
 
 def without_prior(template: Surface, cases: list[Case]) -> dict[str, np.ndarray]:
-    """Errors (C, 3) of the template where it is, and rigidly aligned to the scan."""
-    rows: dict[str, list] = {"unregistered": [], "rigid": []}
+    """Errors (C, 3) of the template where it is, rigidly aligned to the scan, and by Bayesian
+    CPD, the last with CPU seconds."""
+    rows: dict[str, list] = {"unregistered": [], "rigid": [], "Bayesian CPD": []}
     deep = inside_points(template)
+    few = template.vertices[evenly(template.vertices, FEW)]
     for case in cases:
         ours, theirs = dense_points(template), dense_points(case.scan)
-        for name, matrix in (
-            ("unregistered", np.eye(4)),
-            ("rigid", rigid_alignment(ours, theirs, partial=True)),
+        began = time.process_time()
+        field = FittedDisplacement(few, CLASSICAL.get("bcpd")()(few, case.scan.vertices))
+        seconds = time.process_time() - began
+        matrix = rigid_alignment(ours, theirs, partial=True)
+        for name, moved in (
+            ("unregistered", lambda x: x),
+            ("rigid", lambda x, matrix=matrix: transformed(x, matrix)),
+            ("Bayesian CPD", lambda x, field=field: x + field(x)),
         ):
-            error = np.linalg.norm(transformed(template.vertices, matrix) - case.truth, axis=1)
-            target = np.linalg.norm(transformed(deep, matrix) - case.deep, axis=1).mean()
-            rows[name].append((error[~case.seen].mean(), error[case.seen].mean(), target))
+            error = np.linalg.norm(moved(template.vertices) - case.truth, axis=1)
+            target = np.linalg.norm(moved(deep) - case.deep, axis=1).mean()
+            rows[name].append([error[~case.seen].mean(), error[case.seen].mean(), target])
+        rows["Bayesian CPD"][-1] += [np.nan, seconds]
     return {name: np.array(found) for name, found in rows.items()}
 
 
@@ -189,17 +207,17 @@ def row(label: str, found: np.ndarray) -> None:
     numbers = [f"{m:.1f} ± {h:.1f}" for m, h in zip(percent.mean(axis=0), half, strict=True)]
     numbers[0] += f" ({np.median(percent[:, 0]):.1f})"
     if found.shape[1] > 3:
-        numbers += [f"{100 * found[:, 3].mean():.0f} %", f"{np.median(found[:, 4]):.1f}"]
+        within = found[:, 3].mean()
+        numbers += ["" if np.isnan(within) else f"{100 * within:.0f} %"]
+        numbers += [f"{np.median(found[:, 4]):.1f}"]
     else:
         numbers += ["", ""]
     print(f"| {label} | " + " | ".join(numbers) + " |", flush=True)
 
 
-def drawn_cases(
-    template: Surface, count: int, share: float = SEEN, noise: float = NOISE, **truth: object
-) -> list[Case]:
-    found = [true_field(template, 0, number, **truth) for number in range(count)]
-    return [scanned(template, *fields, i, share, noise) for i, fields in enumerate(found)]
+def drawn_cases(template: Surface, count: int) -> list[Case]:
+    found = [true_field(template, 0, number) for number in range(count)]
+    return [scanned(template, *fields, i, SEEN, NOISE) for i, fields in enumerate(found)]
 
 
 def header(*first: str) -> None:
@@ -212,7 +230,7 @@ def main() -> None:
     parser.add_argument("meshes", type=Path)
     parser.add_argument("--deformations", type=int, default=12)
     parser.add_argument("--only", nargs="+", default=list(TEMPLATES), help="or other files")
-    parser.add_argument("--vary", action="store_true", help="share seen, noise, pose")
+    parser.add_argument("--vary", action="store_true", help="one thing at a time changed")
     parser.add_argument("--edges", action="store_true", help="convergence in the element size")
     arguments = parser.parse_args()
     if arguments.edges:
@@ -233,16 +251,21 @@ def main() -> None:
 
 def vary(name: str, template: Surface, prior: OrganPrior, count: int) -> None:
     """One thing at a time changed, with the learned prior."""
-    fields = [true_field(template, 0, number) for number in range(count)]
     header("template", "condition")
+
+    def shown(label: str, cases: list[Case], loose: bool = False) -> None:
+        found = results(template, prior, cases, loose=loose)
+        row(f"{name} | {label}", np.array(list(found)))
+
+    fields = [true_field(template, 0, number) for number in range(count)]
     changed = {f"{share:.0%} seen": (share, NOISE) for share in (0.2, 0.4, 0.6, 0.8, 0.99)}
     changed |= {f"noise {noise:.1%}": (SEEN, noise) for noise in (0.0, 0.01, 0.02)}
     for label, (share, noise) in changed.items():
-        cases = [scanned(template, *field, i, share, noise) for i, field in enumerate(fields)]
-        row(f"{name} | {label}", np.array(list(results(template, prior, cases))))
-    cases = [scanned(template, *field, i, SEEN, NOISE) for i, field in enumerate(fields)]
-    found = results(template, prior, cases, loose=True)
-    row(f"{name} | turned by some 15 degrees, pose found", np.array(list(found)))
+        shown(label, [scanned(template, *x, i, share, noise) for i, x in enumerate(fields)])
+    cases = [scanned(template, *x, i, SEEN, NOISE) for i, x in enumerate(fields)]
+    shown("turned by some 15 degrees, pose found", cases, loose=True)
+    for label, fields in conditions(template, held(template), count):
+        shown(label, [scanned(template, *x, i, SEEN, NOISE) for i, x in enumerate(fields)])
 
 
 def edges(path: Path) -> None:

@@ -27,6 +27,7 @@ NAMED = ("datasets", "backbones", "priors")
 _NOT_YAML = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError)
 _MOST_FAULTS = 30
 _MOST_VALUES, _DEEPEST = 100_000, 50
+_MOST_ELASTIC = 0.25
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*\Z")
 
@@ -47,6 +48,8 @@ Count = Annotated[int, BeforeValidator(_no_bool), Field(ge=1)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
 Fraction = Annotated[Number, Field(ge=0, le=1)]
+Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
+Load = Literal["force", "pressure", "gravity", "shrinkage"]
 
 
 def most_pairs_per_level(percents: Collection[float], widths: Collection[float]) -> float:
@@ -84,15 +87,71 @@ class Source(Section):
         return self
 
 
+class Elasticity(Section):
+    """What is drawn for deformations by finite elements. Lengths are in radii of the mesh."""
+
+    edge: Positive = 0.1
+    """Edge of the cubes."""
+    farthest: Positive = 0.6
+    """Largest displacement at a place, by linear elasticity; the loads are lessened otherwise."""
+    stiffness: Range = [0.5, 2.0]
+    """Young's modulus, relative to any, which varies smoothly over the organ."""
+    poisson: Annotated[
+        list[Annotated[Positive, Field(lt=0.5)]], Field(min_length=2, max_length=2)
+    ] = [0.4, 0.48]
+    """Poisson ratio."""
+    fixed: Literal["exactly", "about"] = "exactly"
+    """Whether given vertices are fixed as they are, or a patch with its middle at one of them, as
+    where an organ hangs is seldom known exactly."""
+    patches: Count = 2
+    """Largest number of patches of the surface that are fixed, where none are given."""
+    patch: Range = [0.2, 0.5]
+    """Radius of a patch."""
+    loads: list[Load] = Field(
+        default=["force", "force", "gravity", "gravity", "pressure", "shrinkage"], min_length=1
+    )
+    """Kinds of loads to draw from: on a place of the surface, on all of the organ, across the
+    surface at a place, and by heat within it. What is named twice comes twice as often."""
+    together: Count = 3
+    """Largest number of loads at once."""
+    width: Range = [0.3, 0.8]
+    """Width of loads on a place."""
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        for name, value in self:
+            if isinstance(value, list) and name != "loads" and value[0] > value[1]:
+                raise ValueError(
+                    f"`{name}` goes from {value[0]} down to {value[1]}; expected the lower first"
+                )
+        return self
+
+
+class Simulation(Elasticity):
+    """Deformations of one organ by finite elements. Lengths are in radii of its mesh."""
+
+    fields: Count = 200
+    """Deformations."""
+    amplitude: Range = [0.05, 0.25]
+    """Mean displacement of the surface; less where a cube would be turned inside out."""
+    inclusion: Range = [2.0, 10.0]
+    """How many times stiffer an inclusion is, where one is given."""
+    shared: Count = 4
+    """Deformations that share what is fixed and how stiff it is."""
+
+
 class Recipe(Section):
     """How deformed targets are made, for `synthetic` and for `path` with undeformed meshes."""
 
+    kind: Literal["kernels", "elastic"] = "kernels"
+    """By the published recipe, or by finite elements, which needs closed meshes."""
     shape: Literal["primitives", "tissue"] = "primitives"
     """Synthetic base objects: SynBench-like primitives or DeformedTissue-like 2.5D patches."""
     objects: Count = 34
     """Number of synthetic base objects."""
     levels: list[Positive] = Field(default=[0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8], min_length=1)
-    """Deformation levels."""
+    """Deformation levels; of `elastic` the mean displacement of the surface that loads are to
+    bring about, in radii, 0.25 at most."""
     control_percents: list[Positive] = Field(default=[2.0, 5.0, 10.0], min_length=1)
     """Shares of control points, in percent of the sampled points."""
     widths: list[Positive] = Field(default=[0.3, 0.4, 0.5], min_length=1)
@@ -101,10 +160,31 @@ class Recipe(Section):
     """Standard deviation per coordinate of a control displacement at level 1."""
     pairs_per_level: Count = 1
     """Targets per object and level. Their percentages and widths are first those of the two lists,
-    then drawn from the ranges that the lists span."""
+    then drawn from the ranges that the lists span. Those of `elastic` are the same
+    bodies under the same kinds of loads at every level."""
+    elastic: Elasticity = Elasticity()
+    """For `elastic`: what is drawn."""
+    fixed_label: str | None = None
+    """For `elastic`: a label of the meshes, NAME or NAME=VALUE, whose vertices do not move; by
+    default patches are drawn."""
+
+    @model_validator(mode="after")
+    def _elastic(self):
+        if self.kind != "elastic":
+            return self
+        if self.shape == "tissue":
+            raise ValueError("`shape: tissue` makes open patches; `kind: elastic` needs an inside")
+        if max(self.levels) > _MOST_ELASTIC or len(set(self.levels)) < len(self.levels):
+            raise ValueError(
+                f"`levels` are {self.levels}; `kind: elastic` expects different ones, parts of the "
+                f"radius up to {_MOST_ELASTIC}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _combinations(self):
+        if self.kind == "elastic":
+            return self
         most = most_pairs_per_level(self.control_percents, self.widths)
         if self.pairs_per_level > most:
             raise ValueError(
@@ -288,59 +368,6 @@ class LatentFlowArguments(PCAResidualArguments):
     learning_rate: Positive = 3.0e-4
     weight_decay: NonNegative = 0.1
     """AdamW's decoupled weight decay."""
-
-
-Range = Annotated[list[Positive], Field(min_length=2, max_length=2)]
-Load = Literal["force", "pressure", "gravity", "shrinkage"]
-
-
-class Simulation(Section):
-    """Deformations of one organ by finite elements. Lengths are in radii of its mesh."""
-
-    fields: Count = 200
-    """Deformations."""
-    edge: Positive = 0.1
-    """Edge of the cubes."""
-    amplitude: Range = [0.05, 0.25]
-    """Mean displacement of the surface; less where a cube would be turned inside out."""
-    farthest: Positive = 0.6
-    """Largest displacement at a place, by linear elasticity; the loads are lessened otherwise."""
-    stiffness: Range = [0.5, 2.0]
-    """Young's modulus, relative to any, which varies smoothly over the organ."""
-    inclusion: Range = [2.0, 10.0]
-    """How many times stiffer an inclusion is, where one is given."""
-    poisson: Annotated[
-        list[Annotated[Positive, Field(lt=0.5)]], Field(min_length=2, max_length=2)
-    ] = [0.4, 0.48]
-    """Poisson ratio."""
-    fixed: Literal["exactly", "about"] = "exactly"
-    """Whether given vertices are fixed as they are, or a patch with its middle at one of them, as
-    where an organ hangs is seldom known exactly."""
-    patches: Count = 2
-    """Largest number of patches of the surface that are fixed, where none are given."""
-    patch: Range = [0.2, 0.5]
-    """Radius of a patch."""
-    loads: list[Load] = Field(
-        default=["force", "force", "gravity", "gravity", "pressure", "shrinkage"], min_length=1
-    )
-    """Kinds of loads to draw from: on a place of the surface, on all of the organ, across the
-    surface at a place, and by heat within it. What is named twice comes twice as often."""
-    together: Count = 3
-    """Largest number of loads at once."""
-    width: Range = [0.3, 0.8]
-    """Width of loads on a place."""
-    shared: Count = 4
-    """Deformations that share what is fixed and how stiff it is."""
-
-    @model_validator(mode="after")
-    def _ordered(self):
-        for name in ("amplitude", "stiffness", "inclusion", "poisson", "patch", "width"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ValueError(
-                    f"`{name}` goes from {low} down to {high}; expected the lower first"
-                )
-        return self
 
 
 class OrganLearning(Section):

@@ -63,7 +63,12 @@ def raw(settings: config.Dataset, first_object: int, seed: int, out: Path):
     """
     from dine.data.obtain import obtain
 
-    obtain(settings, out, seed=seed, first_object=first_object)
+    deformations = None
+    if settings.recipe.kind == "elastic":
+        from dine.simulation.targets import ElasticDeformations
+
+        deformations = ElasticDeformations.of(settings.recipe, seed)
+    obtain(settings, out, seed=seed, first_object=first_object, deformations=deformations)
 
 
 @click.command()

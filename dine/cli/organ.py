@@ -4,16 +4,62 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from dine import __version__, config
 from dine.cli.console import tell
 from dine.cli.options import IN, gathered, own_out_option, seed_option, settings_option
+from dine.errors import ConfigError
+from dine.files import digest
+from dine.provenance import code_digest
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from dine.geometry.surface import Surface
 
 
 def _simulation(fields: int | None, settings: config.Simulation) -> config.Simulation:
     return settings if fields is None else settings.model_copy(update={"fields": fields})
+
+
+def _fixed(surface: Surface, file: Path | None, label: str | None) -> np.ndarray | None:
+    """Mask (V,) of the vertices that do not move; None to have patches drawn.
+
+    Raises:
+        ConfigError: said twice.
+        DataError: as for the two.
+    """
+    from dine.simulation.fields import labelled_vertices, read_vertex_numbers
+
+    if file and label:
+        raise ConfigError("What is fixed is said by --fixed or by --fixed-label, not by both.")
+    if label:
+        return labelled_vertices(surface, label)
+    return read_vertex_numbers(file, len(surface.vertices)) if file else None
+
+
+def _simulation_key(
+    surface: Surface,
+    settings: config.Simulation,
+    seed: int,
+    fixed: np.ndarray | None,
+    inclusion: Surface | None,
+) -> str:
+    """Digest of all that decides on a field."""
+    from dine.simulation.fields import template_digest
+
+    said = [
+        template_digest(surface),
+        inclusion and template_digest(inclusion),
+        None if fixed is None else fixed.nonzero()[0].tolist(),
+        settings.model_dump(exclude={"fields"}),
+        seed,
+        code_digest("simulate"),
+    ]
+    return digest(said)
 
 
 @click.command()
@@ -24,6 +70,11 @@ def _simulation(fields: int | None, settings: config.Simulation) -> config.Simul
     dict,
     click.option(
         "--fixed", type=IN, help="Text file of vertices that do not move, numbered from 0."
+    ),
+    click.option(
+        "--fixed-label",
+        metavar="NAME[=VALUE]",
+        help="The same by a label of TEMPLATE's vertices: those of a value, or of all but 0.",
     ),
     click.option("--inclusion", type=IN, help="A closed mesh within TEMPLATE that is stiffer."),
 )
@@ -38,24 +89,31 @@ def _simulation(fields: int | None, settings: config.Simulation) -> config.Simul
 def simulate(template, out, known, settings, seed, workers):
     """Deform TEMPLATE, a closed mesh of an organ, by finite elements under drawn loads.
 
+    What an interrupted run finished is kept beside OUT; the same command goes on from there.
+
     Example: dine simulate liver.ply -o fields.h5
     """
     from dine.io.readers import read_surface
-    from dine.simulation.fields import read_vertex_numbers, write_deformations
+    from dine.simulation.fields import write_deformations
     from dine.simulation.simulate import simulate as run
+    from dine.simulation.unfinished import Unfinished
 
     surface = read_surface(template)
-    fixed, inclusion = known["fixed"], known["inclusion"]
+    fixed = _fixed(surface, known["fixed"], known["fixed_label"])
+    inclusion = known["inclusion"] and read_surface(known["inclusion"])
+    kept = Unfinished(out, _simulation_key(surface, settings, seed, fixed, inclusion))
     found = run(
         surface,
         settings,
         seed=seed,
-        fixed=fixed and read_vertex_numbers(fixed, len(surface.vertices)),
-        inclusion=inclusion and read_surface(inclusion),
+        fixed=fixed,
+        inclusion=inclusion,
         workers=workers or os.cpu_count() or 1,
+        kept=kept,
     )
     facts = {"seed": seed, "settings": settings.model_dump_json(), "version": __version__}
     write_deformations(out, found, facts)
+    kept.remove()
     counts = f"{len(surface.vertices)} vertices and {len(found.nodes[0])} nodes"
     tell([f"{out}: {len(found.vertices)} fields of {counts}"])
 

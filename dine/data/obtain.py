@@ -10,7 +10,7 @@ import pandas as pd
 
 from dine.config import Dataset
 from dine.data.layout import Inventory, scan
-from dine.data.raw import Deformations, deform_bases, synthesise
+from dine.data.raw import Deformations, Targets, deform_bases, synthesise
 from dine.errors import DataError
 from dine.files import atomic_path, digest, file_digest, read_json, write_json
 from dine.progress import LOG_SECONDS
@@ -23,7 +23,14 @@ log = logging.getLogger(__name__)
 SYNTHETIC, BASES, PATH, DOI = "synthetic", "bases", "path", "doi"
 
 
-def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) -> None:
+def obtain(
+    dataset: Dataset,
+    folder: Path,
+    *,
+    seed: int,
+    first_object: int = 0,
+    deformations: Targets | None = None,
+) -> None:
     """Make or find a dataset's raw files.
 
     Writes into ``folder``: ``raw.json`` (where the files are, how they came about and a digest),
@@ -35,23 +42,27 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
         folder: the dataset's results folder.
         seed: of generated objects and deformations.
         first_object: number of the first synthetic object, to keep datasets apart.
+        deformations: of undeformed objects; by default those of the published recipe.
 
     Raises:
+        ValueError: a recipe of another kind, without its deformations.
         DataError: nothing usable was found.
         DownloadError: the download failed.
     """
     source = dataset.source
     made = folder / "raw"
+    if deformations is None:
+        deformations = _published(dataset, seed)
     if source.kind == "synthetic":
         shape, objects = dataset.recipe.shape, dataset.recipe.objects
-        synthesise(made, _deformations(dataset, seed), shape, objects, first_object)
+        synthesise(made, deformations, shape, objects, first_object)
         place, origin = made, SYNTHETIC
     elif source.kind == "path":
         place, origin = Path(source.folder).expanduser(), PATH
         inventory = scan(place)
         if not inventory.has_pairs:
             log.info("%s holds undeformed objects only; making deformed targets", place)
-            deform_bases(made, _deformations(dataset, seed), inventory)
+            deform_bases(made, deformations, inventory)
             place, origin = made, BASES
     else:
         # Imported here, since only this source needs the network.
@@ -77,9 +88,12 @@ def obtain(dataset: Dataset, folder: Path, *, seed: int, first_object: int = 0) 
     write_json(Data(folder).raw, {"folder": str(place), "origin": origin, "content": content})
 
 
-def _deformations(dataset: Dataset, seed: int) -> Deformations:
-    recipe = dataset.recipe.model_dump(exclude={"shape", "objects"})
-    return Deformations(**recipe, points=dataset.pairs.points, seed=seed)
+def _published(dataset: Dataset, seed: int) -> Deformations:
+    recipe = dataset.recipe
+    if recipe.kind != "kernels":
+        raise ValueError(f"the deformations of the recipe {recipe.kind!r} are missing")
+    own = ("levels", "control_percents", "widths", "amplitude", "pairs_per_level")
+    return Deformations(**recipe.model_dump(include={*own}), points=dataset.pairs.points, seed=seed)
 
 
 class _Download:

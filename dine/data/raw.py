@@ -6,8 +6,9 @@
     <folder>/Deformation_Level/<level>/Source_<object>_<a>_<b>.ply
     <folder>/Deformation_Level/<level>/Target_<object>_<a>_<b>.ply
 
-<a> is the percentage of control points, <b> the width of the Gaussian. Only the target is
-deformed: same vertices and faces, same order, moved.
+<a> and <b> are two numbers that say which deformation it is, by the published recipe the percentage
+of control points and the width of the Gaussian. Only the target is deformed: same vertices and
+faces, same order, moved.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from filelock import FileLock
@@ -49,9 +50,24 @@ _GENERATORS = {"primitives": primitive, "tissue": tissue_patch}
 _VAIN_DRAWS = 1000
 
 
+class Targets(Protocol):
+    """How every object is deformed: a dataclass whose fields decide on all of it."""
+
+    seed: int
+    explained: ClassVar[str]
+    """For the folder's README: the recipe, and what <a> and <b> in file names are."""
+
+    def targets(self, surface: Surface, name: str) -> Iterator[tuple[tuple[str, str], Surface]]:
+        """((level, <object>_<a>_<b>), deformed surface) of all pairs of one object.
+
+        Raises:
+            DataError: it cannot be deformed.
+        """
+
+
 @dataclass(frozen=True)
 class Deformations:
-    """How every object is deformed.
+    """The published recipe.
 
     Every object gets ``pairs_per_level`` targets per level, each with its own (a, b): first those
     of ``control_percents`` x ``widths`` in random order, then numbers drawn evenly from the ranges
@@ -78,6 +94,12 @@ class Deformations:
     points: int
     pairs_per_level: int
     seed: int
+
+    explained = """\
+Recipe: round(a / 100 * points) control points, uniform on the surface, each with a normal random
+displacement of standard deviation amplitude * level per coordinate, in object radii; spread with
+exp(-(distance / b)^2), distances in object radii, and summed. a is the percentage of control
+points, b the width of the Gaussian."""
 
     def __post_init__(self):
         for name in ("levels", "control_percents", "widths"):
@@ -148,7 +170,7 @@ class Deformations:
 def write_dataset(
     folder: str | os.PathLike,
     sources: Sequence[tuple[str, Callable[[], Surface]]],
-    deformations: Deformations,
+    deformations: Targets,
     origin: str,
     identity: Any,
 ) -> None:
@@ -178,6 +200,7 @@ def write_dataset(
         "code": code_digest("raw"),
         "origin": origin,
         "parameters": asdict(deformations),
+        "recipe": deformations.explained,
         "bases": identity,
     }
     folder = Path(folder).resolve()
@@ -209,7 +232,7 @@ def write_dataset(
 
 def synthesise(
     folder: str | os.PathLike,
-    deformations: Deformations,
+    deformations: Targets,
     kind: Literal["primitives", "tissue"],
     objects: int,
     first: int = 0,
@@ -237,9 +260,7 @@ def synthesise(
     write_dataset(folder, sources, deformations, SYNTHETIC, identity)
 
 
-def deform_bases(
-    folder: str | os.PathLike, deformations: Deformations, inventory: Inventory
-) -> None:
+def deform_bases(folder: str | os.PathLike, deformations: Targets, inventory: Inventory) -> None:
     """Write a dataset of synthetic deformations of a user's own undeformed meshes or clouds.
 
     Args:
@@ -298,7 +319,7 @@ def _remove(folder: Path) -> None:
 def _fill(
     folder: Path,
     sources: Sequence[tuple[str, Callable[[], Surface]]],
-    deformations: Deformations,
+    deformations: Targets,
     key: dict[str, Any],
 ) -> None:
     """Write everything; provenance.json, by which a folder counts as made, comes last."""
@@ -365,15 +386,13 @@ def _readme(provenance: dict[str, Any]) -> str:
     lines = "\n".join(f"  {name}: {json.dumps(value)}" for name, value in parameters.items())
     return f"""{head}
 
-Recipe: round(a / 100 * points) control points, uniform on the surface, each with a normal random
-displacement of standard deviation amplitude * level per coordinate, in object radii; spread with
-exp(-(distance / b)^2), distances in object radii, and summed.
+{provenance["recipe"]}
 
 {lines}
 
 Files: Data/<object>.ply holds the undeformed objects, Deformation_Level/<level>/ the pairs
-Source_<object>_<a>_<b>.ply and Target_<object>_<a>_<b>.ply; a is the percentage of control points,
-b the width of the Gaussian. Only the target is deformed: same vertices, same order, moved.
+Source_<object>_<a>_<b>.ply and Target_<object>_<a>_<b>.ply. Only the target is deformed: same
+vertices, same order, moved.
 
 {len(provenance["objects"])} objects, {len(provenance["left_out"])} left out (reasons in \
 provenance.json). Made by DINE {provenance["dine_version"]}.

@@ -11,7 +11,7 @@ normalised frame, radii of the template.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -63,6 +63,8 @@ _SHOWN = 0.5
 _UNUSUAL, _LEAST_SCALE = 2.0, 0.5
 _APART = 0.03
 _FOLDED, _INSIDE_OUT = 0.02, 0.1
+Start = Callable[[np.ndarray], np.ndarray]
+"""A field, of places (N, 3) in the normalised frame."""
 _NO_RIM = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
@@ -201,8 +203,10 @@ class _Search:
         places = samples.places(template.vertices)
         return cls(prior.on_surface(samples), places, normals, scan, partial)
 
-    def found(self, placed: Placed, options: SurfaceOptions) -> OrganField:
-        """The most probable field, from the prior's mean."""
+    def found(
+        self, placed: Placed, options: SurfaceOptions, starts: Sequence[Start] = ()
+    ) -> OrganField:
+        """The most probable field, from the prior's mean, and from others too."""
         alignment, prior = placed.alignment, placed.prior
         places = alignment.normalise(self.places)
         inner = np.zeros(len(places), bool)
@@ -215,7 +219,7 @@ class _Search:
         found = refine_on_surface(
             Outline(moving, _NO_RIM),
             Outline(fixed, _NO_RIM),
-            [mean],
+            [mean, *(start(places) for start in starts)],
             LinearGaussian(mean, modes, root.root),
             replace(options, source_looks=not self.partial),
         )
@@ -230,10 +234,12 @@ def organ_field(
     loose: bool,
     partial: bool,
     seed: int,
+    starts: Sequence[Start] = (),
 ) -> tuple[OrganField, _Search]:
     """The field that brings a template, aligned by one of some 4×4 matrices, onto a scan of it.
 
-    ``loose`` if the alignment is not known exactly.
+    ``loose`` if the alignment is not known exactly. ``starts`` are further fields to begin with,
+    beside the prior's mean.
     """
     search = _Search.of(prior, target, partial, seed)
     found = []
@@ -242,7 +248,7 @@ def organ_field(
         if loose:
             for _ in range(_POSES):
                 placed = placed.turned(search.found(placed, _POSE).posterior)
-        found.append(search.found(placed, _FIELD))
+        found.append(search.found(placed, _FIELD, starts))
     return min(found, key=lambda field: field.improbability), search
 
 

@@ -171,11 +171,47 @@ def read_vertex_numbers(path: str | os.PathLike, count: int) -> np.ndarray:
         )
     found = np.zeros(count, bool)
     found[numbers] = True
-    if not found.any():
+    return _some(found, str(path))
+
+
+def labelled_vertices(surface: Surface, label: str) -> np.ndarray:
+    """Mask (V,) of the vertices of one value of a label that a mesh carries.
+
+    Args:
+        surface: with the label in its data.
+        label: ``NAME=VALUE``, or ``NAME`` for all values but 0.
+
+    Raises:
+        DataError: no such label, more than a number a vertex, or no or all vertices.
+    """
+    name, given, value = label.partition("=")
+    if name not in surface.data:
+        known = ", ".join(sorted(surface.data)) or "none"
+        raise DataError(f"{surface.name} has no label {name!r} of its vertices; it has: {known}.")
+    values = np.asarray(surface.data[name])
+    if values.ndim != 1 or values.dtype.kind not in "biuf":
+        raise DataError(f"{name!r} of {surface.name} is not one number a vertex, so no label.")
+    try:
+        found = np.isclose(values, float(value)) if given else values != 0
+    except ValueError:
         raise DataError(
-            f"{path} fixes no vertex, so that nothing would hold the organ; name some, or leave "
-            "the file out to have patches drawn."
+            f"The label {label!r} ends in no number; expected NAME=VALUE, or NAME for all values "
+            "but 0."
+        ) from None
+    return _some(found, f"The label {label!r} of {surface.name}")
+
+
+def _some(fixed: np.ndarray, what: str) -> np.ndarray:
+    """A mask of fixed vertices.
+
+    Raises:
+        DataError: it holds none or all.
+    """
+    if not fixed.any():
+        raise DataError(
+            f"{what} fixes no vertex, so that nothing would hold the organ; name some, or leave "
+            "it out to have patches drawn."
         )
-    if found.all():
-        raise DataError(f"{path} fixes all {count} vertices, so that nothing could move.")
-    return found
+    if fixed.all():
+        raise DataError(f"{what} fixes all {len(fixed)} vertices, so that nothing could move.")
+    return fixed

@@ -17,6 +17,7 @@ from dine.progress import Progress
 from dine.simulation.elasticity import SoftBody
 from dine.simulation.fields import OrganDeformations
 from dine.simulation.loads import Organ, drawn_body, drawn_loads
+from dine.simulation.unfinished import Unfinished
 
 # What random numbers are drawn for, beside the seed and a number.
 _BODY, _LOADS = 8, 9
@@ -34,6 +35,7 @@ def simulate(
     fixed: np.ndarray | None = None,
     inclusion: Surface | None = None,
     workers: int = 1,
+    kept: Unfinished | None = None,
 ) -> OrganDeformations:
     """Deform a closed mesh by drawn loads, with drawn stiffness and held at drawn places.
 
@@ -47,6 +49,7 @@ def simulate(
         fixed: (V,) bool, vertices that do not move; None to draw patches.
         inclusion: a closed mesh within it that is stiffer.
         workers: threads.
+        kept: where to keep what is done, and to find what was.
 
     Raises:
         DataError: a mesh without a clear inside or in several parts, or an inclusion elsewhere.
@@ -61,17 +64,23 @@ def simulate(
     organ = Organ.of(source, voxelised(source, settings.edge))
     soft = None if inclusion is None else share_inside(organ.voxels, normalised(inclusion))
     count = settings.fields
+    if kept is not None:
+        kept.begin()
     nodes = np.empty((count, len(organ.voxels.nodes), 3), np.float32)
     vertices = np.empty((count, len(surface.vertices), 3), np.float32)
 
     def solve(first: int) -> slice:
         rows = slice(first, min(first + settings.shared, count))
-        rng = np.random.default_rng([_BODY, seed, first // settings.shared])
-        body = drawn_body(organ, settings, rng, fixed, soft)
-        found = _deformed(organ, settings, body, seed, range(rows.start, rows.stop))
-        for row, field in zip(range(rows.start, rows.stop), found, strict=True):
-            nodes[row] = frame.scale * field
-            vertices[row] = frame.scale * (organ.carrier @ field)
+        found = kept and kept.get(rows)
+        if found is None:
+            rng = np.random.default_rng([_BODY, seed, first // settings.shared])
+            body = drawn_body(organ, settings, rng, fixed, soft)
+            moved = _deformed(organ, settings, body, seed, range(rows.start, rows.stop))
+            carried = np.stack([organ.carrier @ field for field in moved])
+            found = tuple((frame.scale * x).astype(np.float32) for x in (moved, carried))
+            if kept is not None:
+                kept.put(rows, *found)
+        nodes[rows], vertices[rows] = found
         return rows
 
     with (

@@ -233,6 +233,33 @@ def test_hidden_places_follow_what_is_seen(prior, known):
     assert moved.mean() < 0.1 * 60
 
 
+def test_an_open_mesh_has_no_inside_but_what_moves_along_goes_with_its_surface(tmp_path):
+    """`simulate` refuses it; learned of deformed meshes its prior registers all the same."""
+    closed = organ()
+    top = closed.vertices[closed.faces].mean(axis=1)[:, 2] < 0.8 * closed.vertices[:, 2].max()
+    used, index = np.unique(closed.faces[top], return_inverse=True)
+    sheet = Surface(closed.vertices[used], index.reshape(-1, 3), "open.ply")
+    write_surface(tmp_path / "open.ply", sheet)
+    done = run("simulate", tmp_path / "open.ply", "-o", tmp_path / "fields.h5")
+    assert "is not closed and so has no inside" in str(done.exception)
+    assert not (tmp_path / "fields.h5").exists()
+    fields = family(30, 0)[:, used].astype(np.float32)
+    found = learn(sheet, [OrganDeformations(sheet, fields)], SETTINGS)
+    assert found.voxels is None
+    size = [8.0, -5.0, 4.0]
+    truth = sheet.vertices + ways(sheet.vertices, size)
+    near = Surface(0.95 * sheet.vertices[::40], None, "near")
+    result = dine.register(
+        sheet, Surface(truth, sheet.faces), prior=found, prealign="off", apply={"near": near}
+    )
+    assert np.linalg.norm(result.moved.vertices - truth, axis=1).mean() < 0.5
+    expected = near.vertices + ways(near.vertices, size)
+    moved = result.applied["near"]
+    apart = np.linalg.norm(moved.vertices - expected, axis=1)
+    assert apart.mean() < 0.2 * np.linalg.norm(expected - near.vertices, axis=1).mean()
+    assert (moved.data["bound_90"] > 0).all()
+
+
 def test_a_whole_scan_is_no_special_case(prior):
     truth = organ().vertices + ways(organ().vertices, [8.0, -5.0, 4.0])
     scan = Surface(truth, organ().faces)

@@ -23,9 +23,12 @@ from dine.data.batch import make_batch
 from dine.data.fields import read_fields
 from dine.data.obtain import obtain
 from dine.data.pairs import read_pairs, read_seen, read_variant, write_pairs
+from dine.data.synthetic import primitive
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.files import read_json, write_json
 from dine.geometry.distance import chamfer
+from dine.geometry.surface import Surface
+from dine.io.writers import write_surface
 from dine.models.inference import predict_fields
 from dine.models.state import one_writer
 from dine.priors import FlowPrior, load_prior
@@ -533,6 +536,43 @@ def test_a_folder_of_undeformed_meshes_becomes_a_dataset(chain, tmp_path):
     inventory = pd.read_csv(tmp_path / "out" / "inventory.csv")
     assert inventory["pairs"].tolist() == [4]
     assert "broken" in (tmp_path / "out" / "raw" / "provenance.json").read_text()
+
+
+def test_deformations_by_finite_elements_become_a_dataset(tmp_path):
+    """Of closed meshes only; the same body and loads at every level stay in one split."""
+    meshes = tmp_path / "scans"
+    closed = primitive(0, 0)
+    write_surface(meshes / "closed.ply", closed)
+    write_surface(meshes / "open.ply", Surface(closed.vertices, closed.faces[1:]))
+    recipe = {"kind": "elastic", "levels": [0.02, 0.1], "pairs_per_level": 3}
+    settings = {
+        "source": {"kind": "path", "folder": str(meshes)},
+        "recipe": recipe | {"elastic": {"edge": 0.4}},
+    }
+    dine("raw", "--settings", json.dumps(settings), "--out", tmp_path / "out")
+    made = read_json(tmp_path / "out" / "raw" / "provenance.json")
+    assert made["objects"] == {"closed": "closed"}
+    assert "is not closed and so has no inside" in made["left_out"]["open"]
+    assert "finite elements" in (tmp_path / "out" / "raw" / "README.txt").read_text()
+    shares = {"by": "deformation", "train": 0.4, "val": 0.3, "test": 0.3}
+    dine(
+        *("pairs", "--raw", tmp_path / "out" / "raw.json", "--out", tmp_path / "pairs.h5"),
+        *("--settings", json.dumps({"points": 64, "split": shares})),
+    )
+    pairs = read_pairs(tmp_path / "pairs.h5")
+    assert pairs.known.all()
+    assert len(pairs) == 6
+    fields = dict(zip(pairs.name.tolist(), pairs.displacement, strict=True))
+    parts = dict(zip(pairs.name.tolist(), pairs.split.tolist(), strict=True))
+    for number in range(3):
+        small, large = (f"{level}/closed_{number}_0" for level in (0.02, 0.1))
+        assert parts[small] == parts[large]
+        size = [np.linalg.norm(fields[name], axis=1).mean() for name in (small, large)]
+        assert size[0] == pytest.approx(0.02, rel=0.3)
+        assert size[0] < size[1] < 0.15
+        both = (fields[small] * fields[large]).sum()
+        norms = np.linalg.norm(fields[small]) * np.linalg.norm(fields[large])
+        assert both / norms > 0.8
 
 
 def test_a_folder_in_the_published_layout_is_used_as_it_is(chain, tmp_path):

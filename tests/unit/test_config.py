@@ -310,6 +310,22 @@ def test_recipes_may_go_beyond_their_lists():
     assert config.most_pairs_per_level([5, 6], [0.3]) == float("inf")
 
 
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({}, "levels"),
+        ({"levels": [0.1], "shape": "tissue"}, "open patches"),
+        ({"levels": [0.1, 0.1]}, "different ones"),
+        ({"levels": [0.1], "elastic": {"patch": [0.5, 0.2]}}, "`patch` goes from 0.5 down to 0.2"),
+        ({"levels": [0.1], "elastic": {"fields": 3}}, "fields"),
+    ],
+)
+def test_elastic_recipes_that_cannot_be(change, match):
+    recipe = {"kind": "elastic", **change}
+    with pytest.raises(ConfigError, match=match):
+        config.validate_section(config.Recipe, recipe, "recipe")
+
+
 def test_a_single_value_of_lambda_needs_no_search():
     choice = {"candidates": [1.0e-4], "extend": 0}
     assert config.validate(changed("lambda_search", choice)).lambda_search.candidates == [1.0e-4]

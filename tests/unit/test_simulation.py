@@ -12,9 +12,14 @@ from dine.config import Simulation
 from dine.errors import ConfigError, DataError
 from dine.geometry.surface import Surface
 from dine.geometry.voxels import CORNERS, share_inside, voxelised
-from dine.io.writers import write_surface
+from dine.io.writers import write_moved, write_surface
 from dine.simulation.elasticity import SoftBody, rotations, unit_stiffness
-from dine.simulation.fields import read_deformations, template_digest, write_deformations
+from dine.simulation.fields import (
+    labelled_vertices,
+    read_deformations,
+    template_digest,
+    write_deformations,
+)
 from dine.simulation.simulate import simulate
 
 pytestmark = pytest.mark.numerical
@@ -229,6 +234,18 @@ def test_finer_cubes_change_the_fields_little():
     assert apart[1] < 0.3
 
 
+def test_parts_that_a_cube_joins_are_one_organ():
+    """Two closed meshes, near to each other as the halves of an organ, go with each other."""
+    both = together(ball(), ball(at=(2.05, 0, 0)))
+    fixed = both.vertices[:, 0] < -0.9
+    settings = Simulation(fields=2, edge=0.25, loads=["gravity"], amplitude=[0.05, 0.05])
+    found = simulate(both, settings, seed=3, fixed=fixed).vertices
+    assert np.isfinite(found).all()
+    assert np.linalg.norm(found[:, 642:], axis=2).mean() > 0.05
+    gap = [np.flatnonzero(np.abs(both.vertices[:, 0] - x) < 1e-9)[0] for x in (1.0, 1.05)]
+    assert np.linalg.norm(found[:, gap[0]] - found[:, gap[1]], axis=1).max() < 0.03
+
+
 def test_patches_that_fix_everything_are_refused():
     with pytest.raises(ConfigError, match="fix all of the surface; lower `patch`"):
         simulate(ball(), FEW.model_copy(update={"patch": [3.0, 3.0]}))
@@ -256,6 +273,79 @@ def test_the_command_writes_what_is_read_back(tmp_path):
     assert np.array_equal(found.nodes, expected.nodes)
     assert np.array_equal(found.voxels.cubes, expected.voxels.cubes)
     assert found.voxels.edge == expected.voxels.edge
+
+
+def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    template, out = tmp_path / "ball.ply", tmp_path / "fields.h5"
+    write_surface(template, ball())
+    words = (template, "-o", out, "--fields", 6, "--workers", 1)
+    words += ("--settings", '{"edge": 0.3, "shared": 2}')
+    done = run(*words)
+    assert done.exit_code == 0, done.exception
+    expected = out.read_bytes()
+    out.unlink()
+    solved = SoftBody.equilibrium
+
+    def interrupted(times):
+        """Bodies that end the run once they were asked more often than so."""
+        left = iter(range(times))
+
+        def solve(*given):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return solved(*given)
+
+        return solve
+
+    monkeypatch.setattr(SoftBody, "equilibrium", interrupted(1))
+    assert run(*words).exit_code != 0
+    assert not out.exists()
+    folder = tmp_path / ".fields.h5.unfinished"
+    (kept,) = folder.glob("*.npz")
+    # What was kept is not solved for again, unless it is damaged or of other settings.
+    monkeypatch.setattr(SoftBody, "equilibrium", interrupted(2))
+    done = run(*words)
+    assert done.exit_code == 0, done.exception
+    assert out.read_bytes() == expected
+    assert not folder.exists()
+    monkeypatch.setattr(SoftBody, "equilibrium", interrupted(2))
+    assert run(*words).exit_code != 0
+    kept.write_bytes(kept.read_bytes()[:1000])
+    monkeypatch.setattr(SoftBody, "equilibrium", interrupted(2))
+    assert run(*words).exit_code == 0
+    assert out.read_bytes() == expected
+    monkeypatch.setattr(SoftBody, "equilibrium", interrupted(2))
+    assert run(*words).exit_code != 0
+    monkeypatch.setattr(SoftBody, "equilibrium", solved)
+    assert run(*words, "--seed", 1).exit_code == 0
+    assert out.read_bytes() != expected
+    assert not folder.exists()
+
+
+def test_a_label_of_the_mesh_says_what_is_fixed(tmp_path):
+    fixed = ball().vertices[:, 2] < -0.5
+    data = {"part": np.where(fixed, 3.0, 1.0).astype(np.float32), "colors": np.zeros((642, 3))}
+    labelled = Surface(ball().vertices, ball().faces, "ball.ply", data)
+    assert np.array_equal(labelled_vertices(labelled, "part=3"), fixed)
+    for label, message in (
+        ("none=1", "has no label 'none' of its vertices; it has: colors, part"),
+        ("colors", "is not one number a vertex"),
+        ("part=three", "ends in no number"),
+        ("part=2", "fixes no vertex"),
+        ("part", "fixes all 642 vertices"),
+    ):
+        with pytest.raises(DataError, match=message):
+            labelled_vertices(labelled, label)
+    write_moved(tmp_path / "ball.ply", ball(), scalars={"part": data["part"]})
+    (tmp_path / "fixed.txt").write_text(" ".join(map(str, np.flatnonzero(fixed))))
+    words = (tmp_path / "ball.ply", "-o", tmp_path / "fields.h5", "--fields", 2)
+    words += ("--settings", '{"edge": 0.3}', "--fixed-label", "part=3")
+    done = run(*words)
+    assert done.exit_code == 0, done.exception
+    found = read_deformations(tmp_path / "fields.h5")
+    assert np.abs(found.vertices[:, fixed]).max() == 0
+    done = run(*words, "--fixed", tmp_path / "fixed.txt")
+    assert isinstance(done.exception, ConfigError)
 
 
 @pytest.mark.parametrize(
