@@ -1,10 +1,12 @@
 """The locks: complete, hashed, without hosts, and within what pyproject.toml allows."""
 
+import os
 import re
 import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -62,3 +64,16 @@ def test_the_locks_are_what_the_project_asks_for():
 def test_every_dependency_has_a_lowest_version():
     for requirement in wanted():
         assert any(clause.operator == ">=" for clause in requirement.specifier), requirement
+
+
+def test_what_hosts_and_hooks_call_exists():
+    jobs = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]
+    called = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    assert called == [".ci/run"]
+    assert os.access(ROOT / called[0], os.X_OK)
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    rules = (ROOT / "Makefile").read_text().splitlines()
+    for hook in hooks:
+        make, target = hook["entry"].split()
+        assert make == "make"
+        assert any(line.startswith(f"{target}:") for line in rules)
