@@ -37,6 +37,7 @@ NEUTRAL = frozenset(
         ".cli",
         ".config",
         ".errors",
+        ".extras",
         ".progress",
         ".provenance",
         ".registry",

@@ -79,13 +79,13 @@ def obtain(
     write_inventory(inventory, folder)
     # Other meshes give another file, so that what was made of the old ones is made again even where
     # the run was killed right after this.
-    if origin == PATH:
-        content = folder_signature(place)
-    elif origin == DOI:
-        content = digest(source.model_dump())
-    else:
-        content = file_digest(made / "provenance.json")
+    content = digest(source.model_dump()) if origin == DOI else _content(place, origin)
     write_json(Data(folder).raw, {"folder": str(place), "origin": origin, "content": content})
+
+
+def _content(place: Path, origin: str) -> str:
+    """What tells files that were found, or made, from others."""
+    return folder_signature(place) if origin == PATH else file_digest(place / "provenance.json")
 
 
 def _published(dataset: Dataset, seed: int) -> Deformations:

@@ -194,15 +194,7 @@ def write_dataset(
             reason in provenance.json), or ``folder`` holds something that DINE did not make.
         StorageError: the folder cannot be written.
     """
-    key = {
-        "made_by": _MAKER,
-        "dine_version": __version__,
-        "code": code_digest("raw"),
-        "origin": origin,
-        "parameters": asdict(deformations),
-        "recipe": deformations.explained,
-        "bases": identity,
-    }
+    key = _key(deformations, origin, identity)
     folder = Path(folder).resolve()
     part = folder.with_name(f".{folder.name}.part")
     old = folder.with_name(f".{folder.name}.old")
@@ -228,6 +220,19 @@ def write_dataset(
             f"Could not write {folder}: {error.strerror or error}; free space or choose another "
             "folder, then run the same command again."
         ) from error
+
+
+def _key(deformations: Targets, origin: str, identity: Any) -> dict[str, Any]:
+    """What a folder was made from."""
+    return {
+        "made_by": _MAKER,
+        "dine_version": __version__,
+        "code": code_digest("raw"),
+        "origin": origin,
+        "parameters": asdict(deformations),
+        "recipe": deformations.explained,
+        "bases": identity,
+    }
 
 
 def synthesise(

@@ -56,13 +56,9 @@ def simulate(
         ConfigError: patches that fix everything.
     """
     frame = Frame.of(surface.vertices, surface.name)
-
-    def normalised(mesh: Surface) -> Surface:
-        return Surface(frame.normalise(mesh.vertices), mesh.faces, mesh.name)
-
-    source = normalised(surface)
+    source = _normalised(surface, frame)
     organ = Organ.of(source, voxelised(source, settings.edge))
-    soft = None if inclusion is None else share_inside(organ.voxels, normalised(inclusion))
+    soft = inclusion and share_inside(organ.voxels, _normalised(inclusion, frame))
     count = settings.fields
     if kept is not None:
         kept.begin()
@@ -90,11 +86,16 @@ def simulate(
     ):
         for rows in pool.map(solve, range(0, count, settings.shared)):
             progress.update(rows.stop - rows.start)
-    voxels = organ.voxels
-    restored = Voxels(
-        frame.restore(voxels.nodes), voxels.cubes, voxels.inside, voxels.edge * frame.scale
-    )
-    return OrganDeformations(surface, vertices, restored, nodes)
+    return OrganDeformations(surface, vertices, _restored(organ.voxels, frame), nodes)
+
+
+def _normalised(mesh: Surface, frame: Frame) -> Surface:
+    return Surface(frame.normalise(mesh.vertices), mesh.faces, mesh.name)
+
+
+def _restored(voxels: Voxels, frame: Frame) -> Voxels:
+    edge = voxels.edge * frame.scale
+    return Voxels(frame.restore(voxels.nodes), voxels.cubes, voxels.inside, edge)
 
 
 def _deformed(

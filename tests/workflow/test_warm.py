@@ -76,7 +76,8 @@ WAITS = """
 import signal, sys, time
 signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
 print("ready", flush=True)
-time.sleep(60)
+for _ in range(600):  # a signal just before a sleep does not end it
+    time.sleep(0.1)
 """
 
 
