@@ -317,7 +317,7 @@ class _Search:
         agreeing[:count] &= options.source_looks
         agreeing[count:] &= options.target_looks
         # What lies beyond the end of a surface finds its rim, wherever it belongs.
-        beyond = np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
+        beyond = self._beyond(index, matched)
         agreeing &= ~beyond
         # As much weight for the target's points as for the source's.
         scale = np.ones(len(index))
@@ -367,9 +367,15 @@ class _Search:
         index, matched, ours = self._matches(moved, self.options.turning * deviation)
         _, _, squared, agreeing = self._apart(moved, index, matched, ours)
         met = agreeing & (squared < (self.options.reach * deviation) ** 2)
-        ends = np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
-        sides = slice(count), slice(count, None)
-        return tuple(Coverage(met[side], ends[side] & ~met[side]) for side in sides)
+        beyond = self._beyond(index, matched) & ~met
+        return tuple(
+            Coverage(met[side], beyond[side]) for side in (slice(count), slice(count, None))
+        )
+
+    def _beyond(self, index: np.ndarray, matched: np.ndarray) -> np.ndarray:
+        """Matches (n,), first those that the source looked for, that found where the other ends."""
+        count = len(self.source.points)
+        return np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
 
     def _matches(
         self, moved: np.ndarray, turning: float

@@ -84,8 +84,9 @@ def measure(
     aligned = surface_distance(pair.alignment.align(source), target, shown=shown)
     after = surface_distance(motion(source), target, shown=shown)
     # Points alone cannot tell a small motion from where they happened to be drawn.
-    surfaces = settings.surfaces and min(shown) > 0
-    floor = _spacing(source) + _spacing(target) if surfaces else 0.0
+    floor = 0.0
+    if settings.surfaces:
+        floor = bool(shown[0]) * _spacing(target) + bool(shown[1]) * _spacing(source)
     checks = {"remaining": _remaining(aligned["chamfer"], after["chamfer"], floor)}
     if correspondence.inconsistency is not None:
         checks["inconsistency"] = correspondence.inconsistency

@@ -105,6 +105,10 @@ def register(
         ConfigError: unusable settings.
     """
     chosen = _overlap(overlap, partial)
+    if guide is None and guide_error is not None:
+        raise ConfigError(
+            "The error of landmarks to keep to (guide_error) needs such landmarks (guide)."
+        )
     if prior is not None:
         if chosen not in (Overlap.AUTO, Overlap.TARGET_IN_SOURCE):
             raise ConfigError(

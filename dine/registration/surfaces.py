@@ -116,7 +116,8 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     )
     drawn = oriented_points(source, _DRAWN * SOURCE_POINTS, rng)
     drawn = drawn.at(evenly(drawn.points, SOURCE_POINTS))
-    spacing = float(np.median(cKDTree(drawn.points).query(drawn.points, k=2)[0][:, 1]))
+    tree = cKDTree(drawn.points)
+    spacing = float(np.median(tree.query(drawn.points, k=2)[0][:, 1]))
     moving = Outline(drawn, rim_of(source, spacing))
     fixed = Outline(oriented_points(target, TARGET_POINTS, rng), rim_of(target, spacing / 4))
     guides = settings.guide.within(pair.alignment) if settings.guide else NO_GUIDES
@@ -142,7 +143,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
     unmet, shown, lacking = _covered(end, settings.overlap)
-    nearest = cKDTree(drawn.points).query(found.start)[1]
+    nearest = tree.query(found.start)[1]
     return replace(
         found,
         field=anywhere(found.start),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from dine.errors import ConfigError
+from dine.errors import ConfigError, DataError
 from dine.geometry.distance import distances
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.rigid import Alignment
@@ -93,6 +93,8 @@ class Guide:
     error: float | None = None
 
     def __post_init__(self) -> None:
+        if len(self.here) == 0:
+            raise DataError("There are no landmarks to keep to; leave them out, or give some.")
         if self.error is not None and not 0 < self.error < float("inf"):
             raise ConfigError(f"The error of the guiding landmarks is {self.error}; expected > 0.")
 
