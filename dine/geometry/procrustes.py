@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import trimesh.registration
 
-from dine.geometry.rigid import transformed
+from dine.geometry.rigid import motion_between, transformed
 
 _ITERATIONS = 100
 _CONVERGED = 1e-10
@@ -14,10 +13,7 @@ _CONVERGED = 1e-10
 def laid_onto(points: np.ndarray, others: np.ndarray, used: np.ndarray) -> np.ndarray:
     """(V, 3) points moved rigidly so that those of a mask (V,) have the least squared distances
     from the corresponding (V, 3) others (Kabsch)."""
-    matrix = trimesh.registration.procrustes(
-        points[used], others[used], reflection=False, scale=False, return_cost=False
-    )
-    return transformed(points, matrix)
+    return transformed(points, motion_between(points[used], others[used]))
 
 
 def centroid_size(points: np.ndarray) -> float:

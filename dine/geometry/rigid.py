@@ -175,7 +175,8 @@ def _robust(
 
 def motion_between(a: np.ndarray, b: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """The 4×4 rigid motion of least squared distances, weighted by (n,), of corresponding points
-    (n, 3), which do not lie on a line."""
+    (n, 3), which do not lie on a line (Kabsch)."""
+    # trimesh's procrustes takes weights for the middles alone, not for the rotation.
     middles = [np.average(points, axis=0, weights=weight) for points in (a, b)]
     turn, _ = Rotation.align_vectors(b - middles[1], a - middles[0], weights=weight)
     motion = np.eye(4)
