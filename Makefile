@@ -35,7 +35,7 @@ kill-test: .venv/installed
 check: .venv/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/snakefmt --check Snakefile workflow/rules
+	$(BIN)/snakefmt --check Snakefile workflow/Snakefile workflow/rules
 	$(BIN)/snakemake --lint
 	$(BIN)/dine config check config.yaml
 	$(BIN)/dine config check config/evidence.yaml config.yaml config/tiny.yaml
@@ -47,7 +47,7 @@ check: .venv/installed
 format: .venv/installed
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
-	$(BIN)/snakefmt Snakefile workflow/rules
+	$(BIN)/snakefmt Snakefile workflow/Snakefile workflow/rules
 
 # The documentation site, in site/; a link that leads nowhere is an error.
 docs: .venv/installed

@@ -1,5 +1,6 @@
 """The locks: complete, hashed, without hosts, and within what pyproject.toml allows."""
 
+import hashlib
 import os
 import re
 import tomllib
@@ -12,7 +13,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
-LOCKS = ("requirements.lock", "requirements-tools.lock", "requirements-torch.lock")
+LOCKS = ("requirements.lock", "requirements-torch.lock", "requirements-tools.lock")
 
 
 def locked(name):
@@ -64,6 +65,16 @@ def test_the_locks_are_what_the_project_asks_for():
 def test_every_dependency_has_a_lowest_version():
     for requirement in wanted():
         assert any(clause.operator == ">=" for clause in requirement.specifier), requirement
+
+
+def test_other_locks_give_another_conda_environment():
+    locks = b"".join((ROOT / name).read_bytes() for name in LOCKS if "tools" not in name)
+    environment = (ROOT / "workflow" / "envs" / "dine.yaml").read_text()
+    assert hashlib.sha256(locks).hexdigest()[:16] in environment, "run `make lock`"
+    assert "`make lock`: " in environment
+    python = next(x for x in yaml.safe_load(environment)["dependencies"] if x.startswith("python="))
+    jobs = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]
+    assert python == f"python={jobs['ci']['steps'][1]['with']['python-version']}"
 
 
 def test_what_hosts_and_hooks_call_exists():

@@ -51,9 +51,13 @@ DATA = FILES.data("{dataset}")
 STAGE1 = FILES.run("{dataset}", "{backbone}", "stage1")
 NETWORK = FILES.network("{dataset}", "{backbone}", "{run}")
 
-# Rules call the `dine` that belongs to the Python that runs Snakemake.
-shell.prefix(
-    f"set -euo pipefail; export PATH={str(Path(sys.executable).parent)!r}:$PATH; "
+# Rules call the `dine` that belongs to the Python that runs Snakemake; with `--sdm conda` that of
+# their environment, which is put before it, and installed from the sources of this workflow.
+BIN = str(Path(sys.executable).parent)
+FOLDERS = os.environ.get("PATH", os.defpath).split(os.pathsep)
+os.environ.update(
+    PATH=os.pathsep.join(dict.fromkeys([BIN, *FOLDERS])),
+    DINE_SOURCES=str(ROOT or ""),
 )
 
 # What a user asked for, for the records of what it gave; jobs are started by other commands.
