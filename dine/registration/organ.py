@@ -306,6 +306,7 @@ def register_organ(
         bound = field.placed.alignment.frame.scale * field.bounds(surface.vertices)[1]
         moved = result.motion.surface(surface)
         result.applied[name] = replace(moved, data={**surface.data, BOUND_NAME: bound})
+        result.applied_from[name] = surface.vertices
         report["applied"][name] = {BOUND_NAME: _summary(bound)}
     if marks is not None:
         here, there = marks

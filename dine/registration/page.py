@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,12 @@ def view_of(result: RegistrationResult, source: Surface, scalars: Mapping[str, n
     if result.report["settings"]["partial"]:
         explained["HD95"] = "Distance below which 95 % of the target lies from the source."
     shown = {renamed.get(name, (name,))[0]: values for name, values in scalars.items()}
+    start = {n: result.alignment.align(x) for n, x in result.applied_from.items()}
+    further = {
+        n: (replace(x, vertices=start[n]), x.vertices)
+        for n, x in result.applied.items()
+        if n in start
+    }
     return View(
         source,
         result.target,
@@ -82,6 +89,7 @@ def view_of(result: RegistrationResult, source: Surface, scalars: Mapping[str, n
         verdict=result.trust.verdict,
         reasons=result.trust.reasons,
         explained=explained,
+        further=further,
     )
 
 

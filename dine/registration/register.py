@@ -223,6 +223,7 @@ def _registered(
         report,
         alignment=pair.alignment,
         motion=motion,
+        applied_from={name: surface.vertices for name, surface in further.items()},
     )
 
 

@@ -42,6 +42,9 @@ def write_result(path: Path, result: RegistrationResult) -> None:
         "scale": np.array(result.alignment.frame.scale),
     }
     arrays |= {n: x for n in _OPTIONAL if (x := getattr(result, n)) is not None}
+    for i, name in enumerate(result.applied):
+        if name in result.applied_from:
+            arrays[f"from.{i}"] = result.applied_from[name]
     shapes = {"source": result.source, "target": result.target}
     shapes |= {f"applied.{i}": x for i, x in enumerate(result.applied.values())}
     for prefix, surface in shapes.items():
@@ -210,6 +213,10 @@ def _result(arrays: dict[str, np.ndarray], about: dict[str, Any]) -> Registratio
     report = about["report"]
     trust = report["trust"]
     applied = {n: _surface(f"applied.{i}", arrays, about) for i, n in enumerate(about["applied"])}
+    start = {n: x for i, n in enumerate(applied) if (x := arrays.get(f"from.{i}")) is not None}
+    for name, vertices in start.items():
+        if vertices.shape != applied[name].vertices.shape or not np.isfinite(vertices).all():
+            raise ValueError(f"it does not say where {name!r} was")
     return RegistrationResult(
         source,
         target,
@@ -231,4 +238,5 @@ def _result(arrays: dict[str, np.ndarray], about: dict[str, Any]) -> Registratio
         alignment=alignment,
         motion=Motion(alignment, field),
         bound=arrays.get("bound"),
+        applied_from=start,
     )

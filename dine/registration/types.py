@@ -285,6 +285,7 @@ class RegistrationResult:
         motion: the field itself, which moves any points.
         bound: (V,) distance from the true place that 90 % are to stay below; None without a prior
             of the organ.
+        applied_from: (M, 3) where the vertices of each of ``applied`` were, by name.
     """
 
     source: Surface
@@ -303,6 +304,7 @@ class RegistrationResult:
     alignment: Alignment
     motion: Motion
     bound: np.ndarray | None = None
+    applied_from: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         error = self.trust.expected_error

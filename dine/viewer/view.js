@@ -147,20 +147,32 @@
   camera.add(light.target);
   light.target.position.set(0, 0, -1);
 
-  const moving = geometryOf(source, sourceFaces);
-  const end = geometryOf(result, sourceFaces);
-  moving.morphAttributes.position = [end.attributes.position];
-  if (sourceFaces) moving.morphAttributes.normal = [end.attributes.normal];
+  /** A geometry that goes from one place to another. */
+  function movingOf(from, to, faces) {
+    const geometry = geometryOf(from, faces);
+    const end = geometryOf(to, faces);
+    geometry.morphAttributes.position = [end.attributes.position];
+    if (faces) geometry.morphAttributes.normal = [end.attributes.normal];
+    return geometry;
+  }
 
+  const moving = movingOf(source, result, sourceFaces);
   const geometries = {
     moved: moving,
     target: geometryOf(decode(data.target.positions), targetFaces),
     source: geometryOf(source, sourceFaces),
   };
+  const pointSizes = {
+    moved: data.source.pointSize, target: data.target.pointSize, source: data.source.pointSize,
+  };
+  for (const [id, { positions, result, faces, pointSize }] of Object.entries(data.further)) {
+    geometries[id] = movingOf(decode(positions), decode(result), faces && decode(faces));
+    pointSizes[id] = pointSize;
+  }
   const layers = {};
   for (const { id, color, opacity, shown, mesh, lines } of data.layers) {
     const shape = shapeOf(geometries[id], color);
-    shape.userData.pointSize = (id === "target" ? data.target : data.source).pointSize;
+    shape.userData.pointSize = pointSizes[id];
     shape.visible = shown;
     layers[id] = shape;
     scene.add(shape);
@@ -187,7 +199,8 @@
   }
   const moved = layers.moved;
   const plain = moved.material.color.clone();
-  moved.updateMorphTargets();
+  const movers = [moved, ...Object.keys(data.further).map((id) => layers[id])];
+  for (const shape of movers) shape.updateMorphTargets();
 
   // --- colours ------------------------------------------------------------------------------
 
@@ -231,7 +244,7 @@
   let playing = null;
 
   function moveTo(share) {
-    moved.morphTargetInfluences[0] = share;
+    for (const shape of movers) shape.morphTargetInfluences[0] = share;
     morph.value = Math.round(1000 * share);
     get("share").textContent = `${Math.round(100 * share)} %`;
     morph.setAttribute("aria-valuetext", `${Math.round(100 * share)} percent of the motion`);

@@ -44,6 +44,9 @@ _STRETCH = 1.5
 _MOST = 100_000
 # Faces of a target whose mesh is shown at first: of more, its lines would hide what is behind.
 _SPARSE = 8_000
+# Of further shapes, in turn; and how opaque the moved source is at first where they may lie in it.
+_FURTHER_COLORS = ("#b3261e", "#2e7d32", "#7b3fa0", "#8a6d00", "#00727f")
+_GLASS = 45
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ class View:
         verdict: one word on how far to trust the result; empty where nothing is said.
         reasons: sentences for it.
         explained: a sentence on what a scalar, a fact or the verdict means, by its name.
+        further: shapes that moved with the source, such as a tumour, by displayed name: each
+            unmoved, of M vertices, and its (M, 3) moved vertices.
     """
 
     source: Surface
@@ -76,6 +81,7 @@ class View:
     verdict: str = ""
     reasons: Sequence[str] = ()
     explained: Mapping[str, str] = field(default_factory=dict)
+    further: Mapping[str, tuple[Surface, np.ndarray]] = field(default_factory=dict)
 
 
 def write_view(path: str | os.PathLike, view: View, *, overwrite: bool = False) -> None:
@@ -135,6 +141,8 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         _layer("target", "Target", target, target_rows, "#4a5562", opacity=50, shown=sparse),
         _layer("source", "Source", source, rows, "#d08a3c", opacity=60, shown=False),
     ]
+    if view.further:
+        layers[0]["opacity"] = _GLASS
     for layer in layers:
         drawn = small_target if layer["id"] == "target" else small
         layer["mesh"] = drawn.faces is not None
@@ -154,6 +162,7 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
     def normalised(vertices: np.ndarray) -> np.ndarray:
         return (vertices - centre) / radius
 
+    further = [_further(i, *x, normalised) for i, x in enumerate(view.further.items())]
     return {
         "centre": centre.tolist(),
         "radius": radius,
@@ -162,7 +171,8 @@ def _data(view: View, result: np.ndarray) -> dict[str, Any]:
         "target": _shape(small_target, normalised),
         "result": _array(normalised(result[rows]), "float32"),
         "scalars": shown,
-        "layers": layers,
+        "layers": layers + [layer for layer, _ in further],
+        "further": {layer["id"]: shape for layer, shape in further},
         "colormap": _colors(),
         "unit": view.unit,
         "axes": axis_names(target.space),
@@ -222,6 +232,28 @@ def _layer(
         "color": color,
         "opacity": opacity,
         "shown": shown,
+    }
+
+
+def _further(
+    number: int,
+    name: str,
+    shape: tuple[Surface, np.ndarray],
+    normalised: Callable[[np.ndarray], np.ndarray],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The layer of a further shape, and its geometry before and after."""
+    surface, moved = shape
+    if moved.shape != surface.vertices.shape:
+        raise DataError(
+            f"{name!r} has {len(surface.vertices)} vertices but {len(moved)} moved ones; expected "
+            "one row a vertex, in the same order."
+        )
+    small, rows = _light(surface)
+    color = _FURTHER_COLORS[number % len(_FURTHER_COLORS)]
+    layer = _layer(f"further-{number}", name, surface, rows, color, opacity=100, shown=True)
+    layer |= {"mesh": small.faces is not None, "lines": False}
+    return layer, _shape(small, normalised) | {
+        "result": _array(normalised(moved[rows]), "float32"),
     }
 
 

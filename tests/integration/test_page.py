@@ -241,6 +241,43 @@ def test_pictures_are_saved(page, first, browser):
     assert np.abs(half[bar] - seen[bar]).mean() < 20
 
 
+def test_further_shapes_are_seen_and_move_along(browser):
+    """A tumour inside, which goes up while the organ around it goes aside."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    tumour = Surface(ball.vertices * 4 + np.array([190, 0, -50]), ball.faces)
+    target = Surface(RESULT, BODY.faces)
+    further = {"tumour": (tumour, tumour.vertices + np.array([0, 5, 0]))}
+    view = View(SOURCE, target, RESULT, "Further", unit="mm", further=further)
+    write_view(browser.folder / "further.html", view)
+    shown = "document.getElementById('show-further-0').click()"
+    try:
+        browser.open(browser.folder / "further.html")
+        browser.until("document.getElementById('overlay').getAttribute('aria-label')")
+        browser.value("document.getElementById('show-target').click()")
+
+        def place():
+            """Where the tumour is behind the see-through organ."""
+            seen = stage(browser)
+            browser.value(shown)
+            shape = changed(seen, stage(browser))
+            browser.value(shown)
+            reds = seen[shape].mean(axis=0)
+            assert reds[0] > reds[1:].max() + 20
+            return middle(shape), np.ptp(np.nonzero(shape.any(axis=0))[0])
+
+        there, wide = place()
+        assert wide == pytest.approx(8 * in_units(browser), rel=0.15)
+        browser.click("#morph", across=0.02)
+        here, _ = place()
+        across, up = there - here
+        assert up == pytest.approx(-5 * in_units(browser), rel=0.12)
+        assert abs(across) < 2
+        assert "tumour" in text(browser, "#controls")
+        assert browser.problems == []
+    finally:
+        browser.open(browser.folder / "page.html")
+
+
 def test_what_numbers_mean_stands_there(page):
     whole = page.value("document.querySelector('aside').innerText")
     for words in ("Doubtful", "What doubtful means.", "A reason.", "5 → 1", "What HD95 means."):

@@ -543,6 +543,8 @@ def test_command_writes_everything(files, tmp_path, pair):
     assert "HD95" in done.output
     endings = {"obj", "field.npz", "field.vtp", "result.npz", "json", "html", "before.ply"}
     assert {p.name.removeprefix("moved.") for p in out.parent.iterdir()} == endings
+    # The page shows what moved along.
+    assert 'id="show-further-0"' in out.with_suffix(".html").read_text(encoding="utf-8")
     moved = read_surface(out)
     assert (moved.faces == pair[0].faces).all()
     report = json.loads(out.with_suffix(".json").read_text())

@@ -48,7 +48,11 @@ def assert_same_result(found, expected, shapes):
     np.testing.assert_array_equal(found.distance_to_target, expected.distance_to_target)
     assert found.trust == expected.trust
     assert found.report == expected.report
-    assert found.applied.keys() == expected.applied.keys()
+    assert found.applied.keys() == expected.applied.keys() == found.applied_from.keys()
+    for name, vertices in expected.applied_from.items():
+        np.testing.assert_array_equal(found.applied_from[name], vertices)
+        moved = expected.transform(vertices)
+        np.testing.assert_allclose(found.applied[name].vertices, moved, rtol=0, atol=1e-9)
     for points in shapes:
         np.testing.assert_array_equal(found.transform(points), expected.transform(points))
 

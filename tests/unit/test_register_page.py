@@ -1,9 +1,13 @@
 """What the page of a registration says, and in which words."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from dine.data.synthetic import primitive
+from dine.geometry.frame import Frame
+from dine.geometry.rigid import Alignment
 from dine.geometry.surface import Surface
 from dine.registration.assessment import DOUBTFUL, GOOD, IMPLAUSIBLE
 from dine.registration.page import view_of
@@ -14,7 +18,7 @@ SOURCE = primitive(0, 0)
 ERROR = np.linspace(1, 3, len(SOURCE.vertices))
 
 
-def shown(*, verdict=GOOD, organ=False, partial=False, hd95=12.0):
+def registered(*, verdict=GOOD, organ=False, partial=False, hd95=12.0):
     report = {
         "before": {"hd95": hd95},
         "after": {"hd95": 1.9},
@@ -24,7 +28,7 @@ def shown(*, verdict=GOOD, organ=False, partial=False, hd95=12.0):
         "seconds": 2.0,
         "settings": {"partial": partial},
     }
-    result = RegistrationResult(
+    return RegistrationResult(
         Surface(SOURCE.vertices, SOURCE.faces, name="a/before.ply"),
         Surface(SOURCE.vertices + 1, name="b/after.ply"),
         Surface(SOURCE.vertices + 1, SOURCE.faces),
@@ -38,6 +42,10 @@ def shown(*, verdict=GOOD, organ=False, partial=False, hd95=12.0):
         motion=None,
         bound=3 * ERROR if organ else None,
     )
+
+
+def shown(*, organ=False, **facts):
+    result = registered(organ=organ, **facts)
     scalars = {"displacement": ERROR, "distance to target": ERROR, "expected error": ERROR}
     return view_of(result, SOURCE, scalars | ({"bound 90": 3 * ERROR} if organ else {}))
 
@@ -75,6 +83,24 @@ def test_what_a_prior_of_an_organ_gives_has_its_own_names():
     assert view.facts["90 % bound"] == "6.00"
     assert "Expected error" not in view.facts
     assert "posterior deviation" not in shown().scalars
+
+
+def test_further_shapes_start_where_the_source_does():
+    frame = Frame.of(SOURCE.vertices)
+    turn = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    tumour = Surface(SOURCE.vertices[:9] + 3, name="tumour.ply")
+    result = replace(
+        registered(),
+        alignment=Alignment(turn, frame),
+        applied={"tumour": tumour},
+        applied_from={"tumour": SOURCE.vertices[:9]},
+    )
+    before, after = view_of(result, SOURCE, {}).further["tumour"]
+    x, y, z = SOURCE.vertices[:9].T
+    np.testing.assert_allclose(before.vertices, np.stack([5 - y, x, z], axis=1))
+    np.testing.assert_array_equal(after, tumour.vertices)
+    # Kept by an earlier version, which did not say where it was.
+    assert view_of(replace(result, applied_from={}), SOURCE, {}).further == {}
 
 
 def test_partial_distances_count_from_the_target():

@@ -88,6 +88,30 @@ def test_arrays_come_back(tmp_path):
     assert [entry["unit"] for entry in data["scalars"]] == ["mm", ""]
 
 
+def test_further_shapes_come_with_where_they_were_and_went(tmp_path):
+    tumour = Surface(SOURCE.vertices[:50] * 0.3)
+    inside = Surface(SOURCE.vertices * 0.2, SOURCE.faces)
+    shapes = {"tumour": (tumour, tumour.vertices + 0.1), "<b>": (inside, inside.vertices)}
+    page = view(tmp_path / "a.html", further=shapes)
+    data = page.data()
+    ids = ["moved", "target", "source", "further-0", "further-1"]
+    assert [layer["id"] for layer in data["layers"]] == ids
+    assert [layer["name"] for layer in data["layers"]][3:] == ["tumour", "<b>"]
+    # What lies inside is seen.
+    assert data["layers"][0]["opacity"] < 60
+    assert all(f"show-{key}" in page.ids and f"opacity-{key}" in page.ids for key in ids)
+    assert "lines-further-1" in page.ids
+    assert "lines-further-0" not in page.ids
+    for key, (before, after) in zip(ids[3:], shapes.values(), strict=True):
+        found = data["further"][key]
+        for name, places in (("positions", before.vertices), ("result", after)):
+            there = decode(found[name]).reshape(-1, 3) * data["radius"] + data["centre"]
+            np.testing.assert_allclose(there, places, atol=1e-6)
+    with pytest.raises(DataError, match="'tumour' has 50 vertices but 3 moved ones"):
+        view(tmp_path / "b.html", further={"tumour": (tumour, tumour.vertices[:3])})
+    assert view(tmp_path / "c.html").data()["layers"][0]["opacity"] == 100
+
+
 def test_colours_are_viridis():
     steps = matplotlib.colormaps["viridis"](np.linspace(0, 1, 64))
     assert _colors() == [matplotlib.colors.to_hex(color) for color in steps]
