@@ -97,7 +97,12 @@ def check_place(path: str | os.PathLike) -> None:
             os.stat(path)  # whatever is there, its name can be
         while not folder.exists():
             folder = folder.parent
-        _temporary(path, folder).unlink()
+        try:
+            _temporary(path, folder).unlink()
+        except FileNotFoundError as error:  # as under /proc, where the system alone makes files
+            raise StorageError(
+                f"Could not write {path}: no file can be made in {folder}; choose another folder."
+            ) from error
 
 
 @functools.cache

@@ -268,7 +268,7 @@ _READERS: dict[str, Callable[[Path, bytes], Surface]] = {
     ".vtk": read_vtk,
     ".gii": read_gifti,
     **dict.fromkeys((".pial", ".white", ".orig", ".smoothwm", ".inflated"), read_freesurfer),
-    **dict.fromkeys((".txt", ".csv", ".asc", ".pts"), read_table),
+    **dict.fromkeys((".txt", ".csv", ".tsv", ".asc", ".pts", ".particles"), read_table),
     ".xyz": _read_xyz,
     ".pcd": read_pcd,
     ".fcsv": read_fcsv,

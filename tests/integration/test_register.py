@@ -627,6 +627,10 @@ def test_command_probes_its_output_first(files, tmp_path, monkeypatch):
         done = run("register", source, files[1], "-o", out)
         assert isinstance(done.exception, DineError), done.output
         assert said in str(done.exception)
+    if Path("/proc/self").exists():
+        done = run("register", *files, "-o", "/proc/m.ply")
+        assert isinstance(done.exception, DineError), done.output
+        assert "no file can be made in /proc" in str(done.exception)
     for arguments in (
         ("fields", "--model", "m", "--pairs", "p", "--out", tmp_path / "afile" / "dvf.h5"),
         ("register-many", "pairs.csv", "-o", tmp_path / "afile" / "out"),

@@ -252,7 +252,7 @@ def table(columns, delimiter=" ", form="{}"):
 MORE = np.hstack([V, np.arange(len(V))[:, None], np.full((len(V), 3), 7.0)])
 
 
-@pytest.mark.parametrize("suffix", [".xyz", ".txt", ".csv", ".asc", ".pts"])
+@pytest.mark.parametrize("suffix", [".xyz", ".csv", ".tsv", ".asc", ".pts", ".particles"])
 @pytest.mark.parametrize(
     ("text", "left_out"),
     [
