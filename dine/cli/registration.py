@@ -264,7 +264,8 @@ def register(source, target, further, settings, writing, load_model, grids):
         result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
         stages.begin("writing")
         said = save(result, outputs, applied=shapes, view=writing.view, overwrite=writing.overwrite)
-    files = outputs.files(view=writing.view)
+        said += grids.write(result, overwrite=writing.overwrite)
+    files = outputs.files(view=writing.view) | grids.files
     files |= {"applied": {name: outputs.applied(name, path) for name, path in shapes.items()}}
     lines = [_line(writing.out, result), *(f"  {x}" for x in (*result.trust.reasons, *said))]
     tell(lines, _facts(result, said) | {"files": files}, writing.as_json)

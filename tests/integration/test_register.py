@@ -574,6 +574,7 @@ def test_command_tells_programs_and_the_log(files, tmp_path):
     places = [place for place in told["files"].values() if isinstance(place, str)]
     written = {Path(place) for place in (*places, *told["files"]["applied"].values())}
     assert written == set(tmp_path.glob("moved.*"))
+    assert {tmp_path / "moved.nrrd", tmp_path / "moved.back.mha"} <= written
     lines = log.read_text().splitlines()
     stages = ["reading", "alignment", "network", "points", "surfaces", "measures", "writing"]
     said = [line.split(" ", 1)[1] for line in lines]
