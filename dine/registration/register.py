@@ -117,8 +117,12 @@ def register(
             )
         network = {"model": model, "surfaces": not surfaces}
         network |= {"rounds": rounds != ROUNDS, "points": points != POINTS}
-        network |= {"guide": guide is not None}
         _refuse_network(network)
+        if guide is not None:
+            raise ConfigError(
+                "Landmarks to keep to (--guide) are not taken together with the prior of an organ; "
+                "leave one of both out. --landmarks measures with them."
+            )
         partial = chosen is Overlap.TARGET_IN_SOURCE
         return _with_prior(source, target, prior, (prealign, partial, seed), apply or {}, landmarks)
     source, target = as_surface(source, "source"), as_surface(target, "target")
