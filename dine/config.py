@@ -580,8 +580,9 @@ class Evidence(Section):
     """Seeds of initial weights and training order; the data stay the same."""
     first_seed_only: list[str] = []
     """Priors of the backbones that are trained with the first seed alone."""
-    test_objects: Count = 12
-    """Further synthetic objects of each dataset to evaluate on; other data use the test split."""
+    test_objects: Count | None = None
+    """Further synthetic objects of each dataset to evaluate on, one deformation of each a level. By
+    default, and for data that are not synthetic, the test pairs of `all`."""
     at_levels: list[Positive] = [0.5]
     """Deformation levels at which targets are corrupted or resampled."""
     noise: list[Positive] = [0.03]

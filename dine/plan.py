@@ -279,9 +279,12 @@ class EvidencePlan(Plan):
     # --- data
 
     def has_own_pairs(self, dataset: str) -> bool:
-        """Whether the evidence makes pairs of its own; otherwise the test split is used."""
-        test_sets = self.config.evidence.test_sets
-        return dataset in test_sets or self.config.datasets[dataset].source.kind == "synthetic"
+        """Whether the evidence has pairs of its own; otherwise it uses the test pairs of `all`."""
+        evidence = self.config.evidence
+        if dataset in evidence.test_sets:
+            return True
+        made = self.config.datasets[dataset].source.kind == "synthetic"
+        return made and evidence.test_objects is not None
 
     def test_raw(self, dataset: str) -> str:
         test_set = self.config.evidence.test_sets.get(dataset)

@@ -75,7 +75,8 @@ WORDS = {
     f"{LOWER} and {HIGHER}": "Significantly lower or higher than the reference on the same "
     "pairs: p < 0.05 in Wilcoxon's signed-rank test, corrected by Holm over the levels. "
     f"{LOWER} is better.",
-    "Interval": "95 % interval of the mean difference, found by drawing whole objects anew.",
+    "Interval": "95 % interval of the mean difference, found by drawing whole clusters anew: objects "
+    "that nothing was trained on with all their pairs, and single deformations of those that were.",
     "Effect, wins": "Rank-biserial correlation, −1 where the method is lower on every pair and 1 "
     "where it is higher; and the share of the pairs on which it is lower.",
     PARTIAL: "Evaluated on some of the pairs only; compared with the reference on these.",
@@ -85,9 +86,9 @@ REAL = (
     "same kind of recipe in training and test."
 )
 LIMITS = [
-    "How other objects would do. With fewer than 20 test objects a dataset the "
-    "intervals are too narrow and the p-values, which take pairs of one object as independent, too "
-    "small.",
+    "How other objects would do. Of known objects only other deformations are tested. With fewer "
+    "than 20 unseen ones the intervals are too narrow, and the p-values, which take pairs of one "
+    "object as independent, too small.",
     "How much another training would differ. One seed says nothing about it, and fewer "
     "than ten a rough idea only; a difference no larger than the spread over seeds is not "
     "established by a small p.",

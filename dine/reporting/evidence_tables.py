@@ -128,7 +128,7 @@ def overview_table(evidence: EvidenceStatistics) -> Table:
     reference = evidence.title(evidence.reference)
     caption = (
         f"{_all_data(evidence)}, clean targets. Difference of the mean over all levels to "
-        f"{reference}, in percent of it, with its 95 % interval, of the pairs drawn by object. "
+        f"{reference}, in percent of it, with its 95 % interval, of the pairs drawn by cluster. "
         "Lower or higher: the interval holds no zero. Otherwise the matter is undecided."
     )
     caption += training_chance(evidence.spread) if evidence.spread else ""
@@ -347,7 +347,7 @@ def answer_table(
         name=f"{'levels' if by_level else 'answer'}_{value}_{slug(*place)}",
         title=f"{name} against {evidence.title(evidence.reference)}, {which}: {where}",
         caption=f"{where}, clean targets, {which}. Difference: method minus reference, so negative "
-        "is better; interval: bootstrap over objects; %: of the reference's mean; p: Wilcoxon"
+        "is better; interval: bootstrap over clusters; %: of the reference's mean; p: Wilcoxon"
         f"{', after Holm over the levels' if by_level else ''}; effect: rank-biserial, −1 to 1; "
         "wins: pairs on which the method is lower."
         + (" Failures: pairs with an MCE above 0.1, p by McNemar's test." * (value == "mce")),

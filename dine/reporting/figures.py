@@ -383,7 +383,7 @@ def forest_figure(evidence: EvidenceStatistics, place: tuple[str, str]) -> Figur
         1.7 + 0.27 * len(rows),
         f"{where}: difference to {evidence.title(evidence.reference)}",
         evidence.origin(place[0]),
-        f"All levels from {LARGE:g} on. Bars: 95 % bootstrap interval over objects. Filled: "
+        f"All levels from {LARGE:g} on. Bars: 95 % bootstrap interval over clusters. Filled: "
         "p < 0.05 (Wilcoxon). Triangles: beyond the axis.",
     )
     panels = figure.subplots(1, 2, sharey=True)
