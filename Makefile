@@ -42,6 +42,7 @@ check: .venv/installed
 	$(BIN)/dine config check config.yaml config/full.yaml
 	$(BIN)/dine config check config.yaml config/large.yaml
 	$(BIN)/dine config check config/evidence.yaml config.yaml config/unseen.yaml
+	$(BIN)/dine config check config/evidence.yaml config.yaml config/evidence-short.yaml
 	$(BIN)/snakemake all -n --quiet
 
 format: .venv/installed

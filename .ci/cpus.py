@@ -144,8 +144,11 @@ def main(arguments: list[str]) -> int:
                 lacking(name) or f"{name}: {shlex.join(map('='.join, environment(name).items()))}"
             )
         return 0
-    if len(words) == 2 and words[0] == "run" and words[1] in CPUS and command:
-        return run(words[1], command)
+    if len(words) == 2 and words[0] == "run" and command:
+        if words[1] in CPUS:
+            return run(words[1], command)
+        print(f"{words[1]} is no CPU known here; those are {', '.join(CPUS)}.", file=sys.stderr)
+        return 2
     if words == ["all"] and command:
         codes = {name: run(name, command) for name in CPUS}
         for name, code in codes.items():

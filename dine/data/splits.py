@@ -165,7 +165,7 @@ def _published_split(
     unknown = sorted(set(published).difference(*candidates))
     if unknown:
         _log.warning(
-            "%d names in the published split fit no usable pair: %s%s",
+            "Names in the published split that fit no usable pair: %d (%s%s).",
             len(unknown),
             ", ".join(unknown[:5]),
             ", ..." if len(unknown) > 5 else "",

@@ -75,8 +75,8 @@ WORDS = {
     f"{LOWER} and {HIGHER}": "Significantly lower or higher than the reference on the same "
     "pairs: p < 0.05 in Wilcoxon's signed-rank test, corrected by Holm over the levels. "
     f"{LOWER} is better.",
-    "Interval": "95 % interval of the mean difference, found by drawing whole clusters anew: objects "
-    "that nothing was trained on with all their pairs, and single deformations of those that were.",
+    "Interval": "95 % interval of the mean difference, found by drawing whole clusters anew: "
+    "objects that nothing was trained on with all their pairs, single deformations of the others.",
     "Effect, wins": "Rank-biserial correlation, −1 where the method is lower on every pair and 1 "
     "where it is higher; and the share of the pairs on which it is lower.",
     PARTIAL: "Evaluated on some of the pairs only; compared with the reference on these.",

@@ -54,6 +54,10 @@ def test_failures_are_passed_on(cpus, capfd):
     assert cpus.main(["run", "nehalem", "--", *fail]) == 3
     assert cpus.main(["all", "--", *fail]) == 1
     assert "nehalem: failed (3)" in capfd.readouterr().err
-    for wrong in ([], ["run", "nehalem"], ["run", "pdp11", "--", "ls"], ["all"], ["list", "x"]):
+    for wrong in ([], ["run", "nehalem"], ["all"], ["list", "x"]):
         assert cpus.main(wrong) == 2
+    capfd.readouterr()
+    assert cpus.main(["run", "pdp11", "--", "ls"]) == 2
+    (said,) = capfd.readouterr().err.splitlines()
+    assert said.startswith("pdp11 is no CPU known here; those are nehalem, ")
     assert cpus.main(["run", "nehalem", "--", "no-such-command"]) == 127

@@ -239,9 +239,13 @@ def test_the_evidence_is_planned_from_its_config(tmp_path):
     assert jobs["evidence_evaluate"] == 8
     assert jobs["evidence_classical"] == 4
     assert jobs["search_lambda"] == 1
+    # The test pairs are those of `all`, of known objects and unseen ones; or of further objects.
+    assert jobs["pairs"] == jobs["raw_unseen"] == 2
+    assert "evidence_pairs" not in jobs
     changes = folder / "changes.yaml"
-    changes.write_text("evidence: {seeds: [0], methods: {cpd: null, map: null}}")
+    changes.write_text("evidence: {seeds: [0], methods: {cpd: null, map: null}, test_objects: 2}")
     fewer = planned(folder, "evidence", "--configfile", TINY, changes)
+    assert fewer["evidence_raw"] == fewer["evidence_pairs"] == 2
     assert fewer["stage1"] == 3
     assert fewer["evidence_classical"] == 2
     assert fewer["evidence_refine"] < jobs["evidence_refine"]
