@@ -29,6 +29,9 @@ from dine.simulation.fields import OrganDeformations, template_digest
 
 log = logging.getLogger(__name__)
 
+ROUNDING = 1e-6
+"""Spread of fields, as a share of their size, below which they are equal: files hold float32."""
+
 
 def learn(
     template: Surface, sets: Sequence[OrganDeformations], settings: OrganLearning, *, seed: int = 0
@@ -84,10 +87,11 @@ def components(fields: np.ndarray, number: int) -> tuple[np.ndarray, np.ndarray]
     mean = fields.mean(axis=0)
     flat = (fields - mean).reshape(count, -1)
     variances, vectors = np.linalg.eigh(flat @ flat.T / (count - 1))
+    # What rounding leaves of equal fields is no way to deform.
+    if variances.max() <= ROUNDING**2 * np.square(fields).sum() / count:
+        raise DataError("All deformations are equal; a prior cannot be learned of them.")
     order = np.argsort(-variances)[: min(number, count - 1)]
     order = order[variances[order] > 1e-12 * variances.max()]
-    if not len(order):
-        raise DataError("All deformations are equal; a prior cannot be learned of them.")
     return mean, (vectors[:, order].T @ flat / np.sqrt(count - 1)).reshape(-1, sites, 3)
 
 
