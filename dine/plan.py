@@ -35,6 +35,9 @@ from dine.results import (
 FIRST_PRETRAINING_OBJECT = 1_000_000
 FIRST_TEST_OBJECT = 2_000_000
 
+PRIOR_TITLES = {"pca": "DINE-PCA", "flow": "DINE-Flow", "pca_residual": "PCA with residual"}
+"""What the evidence calls Stage 2 with the priors of `all`, as their tables do."""
+
 
 def section(model: Section) -> str:
     """One section of the configuration as text."""
@@ -459,7 +462,7 @@ class EvidencePlan(Plan):
         for prior in self.config.priors_of_stage2:
             kind = self.config.priors[prior].kind
             known[prior] = {
-                "title": f"DINE-{ {'pca': 'PCA', 'flow': 'Flow'}.get(prior, prior) }",
+                "title": PRIOR_TITLES.get(prior, f"DINE-{prior}"),
                 "group": "prior",
                 "description": f"Stage 2 with the prior {kind}, and the λ of the search for `all`.",
             }

@@ -491,7 +491,9 @@ def level_figure(evidence: EvidenceStatistics, dataset: str) -> Figure | None:
     panels[1, 0].set_ylim(-min(reach, 100), min(reach, 100))
     panels[0, 0].set_ylabel("Mean correspondence error")
     panels[1, 0].set_ylabel("Against the reference (%)")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), **_BESIDE)
+    # Lower than the title, which is as wide as a figure of one backbone.
+    beside = _BESIDE | {"loc": "outside right center"}
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), **beside)
     return figure
 
 

@@ -126,7 +126,6 @@ ROUNDED = ROUNDED.reshape(6, 642, 3)
         (family(6, 0), {"components": 6}, ConfigError, "6 fields allow 5 at most"),
     ],
 )
-@pytest.mark.numerical
 def test_what_cannot_be_learned_from(fields, settings, error, message):
     settings = SETTINGS.model_copy(update=settings)
     with pytest.raises(error, match=message):

@@ -11,6 +11,8 @@ from click.testing import CliRunner
 from dine import config
 from dine.cli import cli
 from dine.errors import ConfigError
+from dine.plan import EvidencePlan
+from dine.reporting.names import METHODS
 from dine.results import (
     NO_BACKBONE,
     backbone_and_seed,
@@ -437,3 +439,24 @@ def test_the_default_run_needs_nothing_of_the_evidence():
     plain = config.load(ROOT / "config.yaml")
     assert runs(plain) == runs(config.load(*FILES))
     assert not plain.evidence.methods
+
+
+# --- the evidence ---------------------------------------------------------------------------------
+
+
+def test_the_evidence_calls_priors_what_their_tables_do():
+    texts = json.loads(EvidencePlan(config.load(*FILES)).method_texts())
+    titles = {name: texts[name]["title"] for name in ("pca", "flow", "pca_residual")}
+    assert titles == {name: METHODS[name] for name in titles}
+
+
+def test_test_pairs_of_the_evidence_are_those_of_all_or_its_own():
+    found = config.load(*FILES)
+    for number, own in ((None, False), (10, True)):
+        evidence = found.evidence.model_copy(update={"test_objects": number})
+        plan = EvidencePlan(found.model_copy(update={"evidence": evidence}))
+        assert plan.has_own_pairs("synbench") is own
+        place = plan.files.evidence if own else plan.files
+        assert plan.test_pairs_file("synbench") == place.data("synbench").pairs
+        files = plan.test_raw_files("synbench")
+        assert len(files) == (1 if own else 2)
