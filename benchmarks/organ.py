@@ -15,7 +15,8 @@ the share of hidden vertices within their 90 % bound. All deformations are synth
 real.
 
 Methods share alignment, matching and schedule, and differ in the prior: a smooth process (that of
-``dine register --surfaces``), principal components alone, and these with a process for the rest.
+``dine register --surfaces``), principal components alone, and these with a process for the rest;
+``one patch`` is the last from as many simulations that are all held at one patch of radius 0.35.
 ``unregistered`` is the template where it lies, ``rigid`` aligned by closest points; ``Bayesian
 CPD`` is :mod:`dine.classical.bcpd` at the settings of the evidence.
 """
@@ -30,7 +31,7 @@ from pathlib import Path
 
 import numpy as np
 from organ_conditions import conditions
-from organ_truth import SHIFTED, attachment, inside_points, true_field
+from organ_truth import HELD, SHIFTED, attachment, inside_points, true_field
 from scipy.spatial.transform import Rotation
 
 from dine.classical.methods import CLASSICAL
@@ -133,14 +134,22 @@ def held(template: Surface) -> np.ndarray:
     return np.linalg.norm(template.vertices - attachment(template), axis=1) <= SHIFTED
 
 
-def learned(path: Path) -> tuple[Surface, OrganPrior]:
-    """A template in radii, and its prior; the time that took is printed."""
+def patch(template: Surface) -> np.ndarray:
+    """Mask (V,) of the vertices of one patch of middling size that may be held."""
+    apart = np.linalg.norm(template.vertices - attachment(template), axis=1)
+    return apart <= sum(HELD) / 2
+
+
+def learned(path: Path, fixed: str = "about") -> tuple[Surface, OrganPrior]:
+    """A template in radii, and its prior, of simulations held as a setting says; the time that took
+    is printed."""
     surface = read_surface(path)
     template = Surface(
         Frame.of(surface.vertices).normalise(surface.vertices), surface.faces, path.name
     )
     began = time.process_time()
-    fields = simulate(template, Simulation(fixed="about"), seed=1, fixed=held(template))
+    where = held(template) if fixed == "about" else patch(template)
+    fields = simulate(template, Simulation(fixed=fixed), seed=1, fixed=where)
     simulated = time.process_time()
     prior = learn(template, [fields], OrganLearning())
     print(
@@ -245,7 +254,9 @@ def main() -> None:
         header("template", "prior")
         for label, found in without_prior(template, cases).items():
             row(f"{name} | {label}", found)
-        for label, other in variants(prior).items():
+        _, one = learned(arguments.meshes / TEMPLATES.get(name, name), "exactly")
+        compared = variants(prior) | {"PCA and process, one patch": one}
+        for label, other in compared.items():
             row(f"{name} | {label}", np.array(list(results(template, other, cases))))
 
 

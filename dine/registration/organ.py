@@ -51,16 +51,17 @@ _POSE = SurfaceOptions(firsts=(0.1,), between=0.05, last=0.03, rounds=6)
 _POSES = 2
 _FIELD = SurfaceOptions(firsts=(0.08, 0.15), last=0.02, rounds=10)
 # Share of the vertices that are to lie within their bounds; and how much wider these are than if
-# prior and matches were right, which was chosen on an organ that docs/guide/organ.md does not show.
+# prior and matches were right, which was chosen on shapes that docs/guide/organ.md does not show.
 BOUND = 0.9
-_WIDER = 3.0
+_WIDER = 1.4
 BOUND_NAME = "bound_90"
 # Parts of the radius: what a scan that shows the organ is near to, and what counts as seen.
 _NEAR, _SEEN = 0.1, 0.05
 _SHOWN = 0.5
 # How much deformations are of what is usual: from here on it is worth a word, and no less is taken
-# to be known.
-_UNUSUAL, _LEAST_SCALE = 2.0, 0.5
+# to be known. Not below 1, or bounds would be narrowest where a scan shows the side that is held,
+# which moves little whatever the rest does.
+_UNUSUAL, _LEAST_SCALE = 2.0, 1.0
 _APART = 0.03
 _FOLDED, _INSIDE_OUT = 0.02, 0.1
 Start = Callable[[np.ndarray], np.ndarray]
@@ -128,7 +129,7 @@ class OrganField:
         return mean + moved + self.root.at(places) @ self.posterior.alone
 
     def covariance(self, carrier: csr_matrix, places: np.ndarray) -> np.ndarray:
-        """(N, 3, 3) of it, as large as deformations of this size are known."""
+        """(N, 3, 3) of it, or more where the organ deformed more than is usual under the prior."""
         _, modes = self.placed.at(carrier, places)
         scale = _WIDER * max(self.posterior.scale, _LEAST_SCALE)
         return scale**2 * self.posterior.covariance(self.root.at(places), modes)

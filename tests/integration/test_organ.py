@@ -21,7 +21,7 @@ from dine.io.writers import write_surface
 from dine.priors.gaussian import LinearGaussian, Posterior
 from dine.priors.organ import load_organ_prior
 from dine.priors.organ_learning import components, learn
-from dine.registration.organ import deviation_and_bound
+from dine.registration.organ import deviation_and_bound, organ_field
 from dine.simulation.fields import OrganDeformations, write_deformations
 from dine.simulation.simulate import simulate
 
@@ -237,6 +237,17 @@ def test_hidden_places_follow_what_is_seen(prior, known):
     expected = expected if known else placed(expected)
     moved = np.linalg.norm(result.applied["tumour"].vertices - expected, axis=1)
     assert moved.mean() < 0.1 * 60
+
+
+def test_what_hardly_moved_narrows_no_bounds(prior):
+    """A scan of the side that is held says little of how far the rest went."""
+    scan, _ = half(organ().vertices)
+    field, _ = organ_field(prior, scan, [np.eye(4)], loose=False, partial=True, seed=0)
+    assert field.posterior.scale < 0.5
+    little = field.bounds(organ().vertices)[1]
+    for scale, wider in ((1.0, 1.0), (3.0, 3.0)):
+        field.posterior.__dict__["scale"] = scale
+        assert np.allclose(field.bounds(organ().vertices)[1], wider * little)
 
 
 def test_an_open_mesh_has_no_inside_but_what_moves_along_goes_with_its_surface(tmp_path):
