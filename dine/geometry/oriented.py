@@ -16,6 +16,7 @@ _REGULAR = 1e-6
 # Neighbours of a point, and the angle in degrees that they leave open at the end of a surface.
 _AROUND = 20
 _OPEN = 140.0
+_EVERYWHERE = slice(None)
 
 
 class OrientedPoints(NamedTuple):
@@ -59,14 +60,15 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def fitted_planes(
-    points: np.ndarray, neighbours: int = NEIGHBOURS
+    points: np.ndarray, neighbours: int = NEIGHBOURS, at: np.ndarray | slice = _EVERYWHERE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (N, 3) of a cloud (N, 3), of arbitrary signs, and how rough it is there (N,).
+    """Unit normals (M, 3) of a cloud (N, 3), of arbitrary signs, and how rough it is there (M,), at
+    all of its points or those of the index ``at``.
 
     The normal is the direction in which the neighbours of a point vary least, the roughness their
     standard deviation in it. Hoppe et al. (1992), Surface reconstruction from unorganized points.
     """
-    near = points[_nearest(points, neighbours)]
+    near = points[_nearest(points, neighbours, at)]
     offset = near - near.mean(axis=1, keepdims=True)
     moments = np.einsum("nka,nkb->nab", offset, offset) / near.shape[1]
     variances, axes = np.linalg.eigh(moments)
@@ -91,10 +93,11 @@ def rim_points(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return gap.max(axis=1) > np.radians(_OPEN)
 
 
-def _nearest(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices (N, k) of the points that are nearest to each, itself first; k is at most N."""
+def _nearest(points: np.ndarray, count: int, at: np.ndarray | slice = _EVERYWHERE) -> np.ndarray:
+    """Indices (M, k) of the points that are nearest to each of some, itself first; k is at most
+    N."""
     count = min(count, len(points))
-    return cKDTree(points).query(points, k=[*range(1, count + 1)])[1]
+    return cKDTree(points).query(points[at], k=[*range(1, count + 1)])[1]
 
 
 def rim_edges(faces: np.ndarray, count: int) -> np.ndarray:

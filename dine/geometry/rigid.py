@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh.registration
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -24,7 +23,10 @@ _WIDE, _NARROW = 0.8, 0.1
 _ROUNDS = 20
 _ALIKE = 0.1
 _TRIED = 3
-_ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
+# Of iterative closest points, the most rounds, and the change of the mean squared distance at
+# which they end.
+_ITERATIONS = 60
+_SETTLED = 1e-7
 
 
 def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -102,7 +104,7 @@ def rigid_alignments(
     The one that fits best comes first. A second one turns the source less: what was deformed much
     can fit better the wrong way round, which shows only once it is deformed back.
 
-    Iterative closest points (trimesh) from where the points are, from coinciding middles, and from
+    Iterative closest points from where the points are, from coinciding middles, and from
     coinciding principal axes; the last are taken only if they fit much better, since a symmetric
     object fits about as well the wrong way round. The identity is kept unless something fits much
     better.
@@ -176,12 +178,15 @@ def _robust(
 def motion_between(a: np.ndarray, b: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """The 4×4 rigid motion of least squared distances, weighted by (n,), of corresponding points
     (n, 3), which do not lie on a line (Kabsch)."""
-    # trimesh's procrustes takes weights for the middles alone, not for the rotation.
-    middles = [np.average(points, axis=0, weights=weight) for points in (a, b)]
-    turn, _ = Rotation.align_vectors(b - middles[1], a - middles[0], weights=weight)
+    share = np.full(len(a), 1 / len(a)) if weight is None else weight / weight.sum()
+    middle, other = share @ a, share @ b
+    cross = (b - other).T @ (share[:, None] * (a - middle))
+    left, _, right = np.linalg.svd(cross)
+    # The last axis is turned where a mirror image would fit better.
+    left[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
     motion = np.eye(4)
-    motion[:3, :3] = turn.as_matrix()
-    motion[:3, 3] = middles[1] - motion[:3, :3] @ middles[0]
+    motion[:3, :3] = left @ right
+    motion[:3, 3] = other - motion[:3, :3] @ middle
     return motion
 
 
@@ -194,7 +199,7 @@ def _motions(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> list[np.ndarra
         return there + float((cKDTree(moved).query(b)[0] ** 2).mean()) if both_ways else there
 
     def improved(start: np.ndarray) -> tuple[float, np.ndarray]:
-        matrix, _, _ = trimesh.registration.icp(a, b, initial=start, **_ICP)
+        matrix = _closest_points(a, b, tree, start)
         return misfit(matrix), matrix
 
     def best_of(starts: Iterable[np.ndarray]) -> tuple[float, np.ndarray]:
@@ -206,6 +211,20 @@ def _motions(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> list[np.ndarra
         best = near
     turned = best_of(_between_middles(a, b, rotation) for rotation in _between_axes(a, b))
     return [turned[1], best[1]] if turned[0] < _MUCH_BETTER * best[0] else [best[1]]
+
+
+def _closest_points(a: np.ndarray, b: np.ndarray, tree: cKDTree, start: np.ndarray) -> np.ndarray:
+    """The 4×4 motion that iterative closest points lead to from a start (Besl and McKay, 1992), of
+    points (N, 3) and others (M, 3), whose tree this is."""
+    motion, before = start, np.inf
+    for _ in range(_ITERATIONS):
+        closest = b[tree.query(transformed(a, motion))[1]]
+        motion = motion_between(a, closest)
+        apart = float(((transformed(a, motion) - closest) ** 2).sum(axis=1).mean())
+        if before - apart < _SETTLED:
+            break
+        before = apart
+    return motion
 
 
 def _between_middles(a: np.ndarray, b: np.ndarray, rotation: np.ndarray) -> np.ndarray:

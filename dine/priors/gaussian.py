@@ -7,8 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
+
+_ROWS = 512
+# Solutions of a system in single precision until its error is that of double precision.
+_REFINEMENTS = 2
+_RESIDUE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,14 @@ def squared_exponential(
     on top of a random affine one, all in the units of the points.
     """
     squared = cdist(a, b, "sqeuclidean")
-    total = affine**2 * (a @ b.T + 1)
+    total = a @ b.T
+    total += 1
+    total *= affine**2
     for width, amplitude in zip(widths, amplitudes, strict=True):
-        total += amplitude**2 * np.exp(squared / (-2 * width**2))
+        part = squared / (-2 * width**2)
+        np.exp(part, out=part)
+        part *= amplitude**2
+        total += part
     return total
 
 
@@ -76,6 +86,18 @@ class CovarianceRoot:
         """
         covariance = squared_exponential(places, self.pivots, *self.kernel)
         return solve_triangular(self.lower, covariance.T, lower=True, check_finite=False).T
+
+    def field(self, places: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
+        """``at(places) @ amplitudes`` (M, k) for amplitudes (r, k), in M · r operations."""
+        at_pivots = solve_triangular(
+            self.lower, amplitudes, lower=True, trans="T", check_finite=False
+        )
+        found = np.empty((len(places), amplitudes.shape[1]))
+        # The covariance of so many rows stays in cache.
+        for first in range(0, len(places), _ROWS):
+            rows = slice(first, first + _ROWS)
+            found[rows] = squared_exponential(places[rows], self.pivots, *self.kernel) @ at_pivots
+        return found
 
 
 def covariance_root(
@@ -109,6 +131,55 @@ def covariance_root(
         left = np.maximum(left - root[:, column] ** 2, 0)
         pivots.append(pivot)
     return CovarianceRoot(root, points[pivots], root[pivots], (widths, amplitudes, affine))
+
+
+def most_probable(prior: LinearGaussian, pulled: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """The mean (N, 3) of :class:`Posterior` alone, in half the time, to some 1e-6 of its length.
+
+    The system is summed up in single precision, and what its solution leaves over is solved for
+    once more (iterative refinement; Higham, 2002, Accuracy and stability of numerical algorithms,
+    chapter 12).
+    """
+    if len(prior.modes) or prior.mean.any():
+        return Posterior(prior, pulled, precision).mean
+    kernel = prior.kernel
+    size = kernel.shape[1]
+    single = kernel.astype(np.float32)
+    # Columns lie one after the other, as the factorisation wants them.
+    system = np.zeros((3 * size, 3 * size), np.float32, order="F")
+    for a in range(3):
+        for b in range(a + 1):
+            block = _weighted_gram(single, precision[:, a, b])
+            system[a * size : (a + 1) * size, b * size : (b + 1) * size] = block.T
+    system[np.diag_indices(len(system))] += 1
+    try:
+        factor = cho_factor(system, lower=True, overwrite_a=True, check_finite=False)
+    except LinAlgError:
+        return Posterior(prior, pulled, precision).mean
+    right = kernel.T @ pulled
+    alone, left = np.zeros_like(right), right
+    for _ in range(_REFINEMENTS):
+        step = cho_solve(factor, left.T.ravel().astype(np.float32), check_finite=False)
+        alone += step.reshape(3, size).T
+        seen = np.einsum("nab,nb->na", precision, kernel @ alone)
+        left = right - kernel.T @ seen - alone
+    # Too near to singular for single precision.
+    if not np.linalg.norm(left) <= _RESIDUE * np.linalg.norm(right):
+        return Posterior(prior, pulled, precision).mean
+    return kernel @ alone
+
+
+def _weighted_gram(kernel: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(r, r) Σ weight · row · rowᵀ over rows (N, r), whose weights may be negative."""
+    # A product of a matrix with itself takes half the time of one with another.
+    order = np.argsort(weight < 0, kind="stable")
+    rows = kernel[order]
+    rows *= np.sqrt(np.abs(weight[order])).astype(kernel.dtype)[:, None]
+    more, less = np.split(rows, [int((weight >= 0).sum())])
+    total = more.T @ more
+    if len(less):
+        total -= less.T @ less
+    return total
 
 
 class Posterior:

@@ -32,7 +32,7 @@ from dine.geometry.oriented import (
     fitted_planes,
     unit,
 )
-from dine.priors.gaussian import LinearGaussian, Posterior
+from dine.priors.gaussian import LinearGaussian, Posterior, most_probable
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,8 @@ DEFAULTS = SurfaceOptions()
 # source, columns of the prior's kernel. Of the one that goes on so many look.
 _FEWER_POINTS, _FEWER_TARGETS, _FEWER_LOOKING, _FEWER_COLUMNS = 1000, 5000, 2000, 150
 _LOOKING = 8000
+# Points at which the roughness of the target is looked at.
+_ROUGHNESS_POINTS = 4000
 # Mean distance of fields that are the same.
 _AGREED = 0.01
 # Share of the clear matches whose normals agree from which signs are known.
@@ -185,7 +187,8 @@ def refine_on_surface(
         guides: observed as they are, in every round.
     """
     # Neither noise nor what planes through neighbours miss of a curved surface is to be followed.
-    rough = float(np.median(fitted_planes(target.surface.points)[1]))
+    some = spread(len(target.surface.points), _ROUGHNESS_POINTS)
+    rough = float(np.median(fitted_planes(target.surface.points, at=some)[1]))
     last = max(options.last, rough)
     between = max(options.between, last)
     search = _Search(source, target, options, _LOOKING, guides)
@@ -273,10 +276,9 @@ class _Search:
         self, field: np.ndarray, prior: LinearGaussian, schedule: np.ndarray
     ) -> Posterior:
         """From a field (N + E + L, 3), the last posterior of a schedule of standard deviations."""
-        for deviation in schedule:
-            posterior = Posterior(prior, *self.observed(field, deviation)[:2])
-            field = posterior.mean
-        return posterior
+        for deviation in schedule[:-1]:
+            field = most_probable(prior, *self.observed(field, deviation)[:2])
+        return Posterior(prior, *self.observed(field, schedule[-1])[:2])
 
     def tell_sides(self, field: np.ndarray) -> None:
         """Find out, where a field (N, 3) brings the source, which normals are the same side's."""
@@ -384,11 +386,11 @@ class _Search:
         for; and the normals (n, 3) of the source's, on the target's side."""
         normals = self.normals(moved)
         there = np.hstack([self.target.points, turning * self.target.normals])
-        tree, asking = cKDTree(there), there[self.asking]
+        tree, asking = _tree(there), there[self.asking]
         ways = []
         for sign in self.signs:
             here = np.hstack([moved, sign * turning * normals])
-            (away, to), (back, asked) = tree.query(here), cKDTree(here).query(asking)
+            (away, to), (back, asked) = tree.query(here), _tree(here).query(asking)
             index = np.concatenate([np.arange(len(moved)), asked])
             matched = np.concatenate([to, self.asking])
             ways.append((np.concatenate([away, back]), index, matched, sign * normals[index]))
@@ -400,6 +402,11 @@ class _Search:
             np.where(nearer if a.ndim == 1 else nearer[:, None], a, b)
             for a, b in zip(first[1:], second[1:], strict=True)
         )
+
+
+def _tree(places: np.ndarray) -> cKDTree:
+    """One that is soon made, for places (n, k) that are asked about once."""
+    return cKDTree(places, balanced_tree=False, compact_nodes=False)
 
 
 def _spacing(points: np.ndarray) -> float:

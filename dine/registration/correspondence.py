@@ -26,7 +26,7 @@ from dine.geometry.rigid import (
 from dine.geometry.surface import Surface
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.progress import stage
-from dine.refinement.refine import ROUNDS, Observed, Options, refine
+from dine.refinement.refine import DEFAULTS, Observed, Options, refine
 from dine.registration.shapes import FEWEST, drawn
 from dine.registration.surfaces import refined_on_surfaces
 from dine.registration.types import Correspondence, Model, Overlap, Pair, Settings
@@ -187,13 +187,15 @@ def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence
         stage("points")
         options = Options(settings.rounds, part=True)
         return replace(_still(pair), field=refine(pair.start, pair.goal, options=options).mean)
-    there = one_way(model.backbone, pair.start, pair.goal, settings)
+    # Points drawn on a mesh lie between its vertices.
+    shared = pair.source.faces is None and pair.target.faces is None
+    there = one_way(model.backbone, pair.start, pair.goal, settings, shared)
     if settings.surfaces and settings.rounds:
         return there  # surfaces will say more
     # The way back has a frame of its own, in which the target is the source.
     frame = Frame.of(pair.goal)
     seen, whole = frame.normalise(pair.goal), frame.normalise(pair.start)
-    back = one_way(model.backbone, seen, whole, settings).field * frame.scale
+    back = one_way(model.backbone, seen, whole, settings, shared).field * frame.scale
     return replace(there, inconsistency=_inconsistency(there, back))
 
 
@@ -204,11 +206,16 @@ def _still(pair: Pair) -> Correspondence:
 
 
 def one_way(
-    backbone: Backbone, start: np.ndarray, goal: np.ndarray, settings: Settings
+    backbone: Backbone,
+    start: np.ndarray,
+    goal: np.ndarray,
+    settings: Settings,
+    shared: bool = True,
 ) -> Correspondence:
     """Where the points ``start`` (N, 3) belong among those of ``goal`` (M, 3), normalised frame,
-    without the check of the way back."""
-    field, indicator = predict_and_refine(backbone, start, goal, settings.device, settings.rounds)
+    without the check of the way back. ``shared``: both may hold the same points."""
+    options = Options(settings.rounds, shared=shared)
+    field, indicator = predict_and_refine(backbone, start, goal, settings.device, options)
     return Correspondence(start, goal, field, indicator, np.ones(len(start), bool))
 
 
@@ -218,7 +225,7 @@ def predict_and_refine(
     source: np.ndarray,
     target: np.ndarray,
     device: torch.device,
-    rounds: int = ROUNDS,
+    options: Options = DEFAULTS,
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Displacement (N, 3) and what tells its errors apart (N,), float64, normalised frame.
 
@@ -234,11 +241,11 @@ def predict_and_refine(
     predicted = result.displacement[0].double().cpu().numpy()
     deviation = marginal_deviation(backbone, result)
     deviation = None if deviation is None else deviation[0].double().cpu().numpy()
-    if rounds == 0:
+    if options.rounds == 0:
         return predicted, deviation
     stage("points")
     observed = Observed.of_network(predicted, deviation)
-    refined = refine(source, target, observed, options=Options(rounds)).mean
+    refined = refine(source, target, observed, options=options).mean
     elsewhere = np.linalg.norm(refined - predicted, axis=1)
     return refined, np.linalg.norm(refined, axis=1) + elsewhere
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve
 from scipy.spatial import cKDTree
 
 from dine.data.sampling import sample_surface
@@ -20,7 +21,7 @@ from dine.geometry.oriented import (
     unit,
 )
 from dine.geometry.surface import Surface
-from dine.priors.gaussian import CovarianceRoot, LinearGaussian, Posterior
+from dine.priors.gaussian import CovarianceRoot, LinearGaussian
 from dine.progress import stage
 from dine.refinement.process import STIFFER, SURFACE
 from dine.refinement.surface import (
@@ -47,6 +48,7 @@ _ROUGHLY = {"last": 0.05, "between": 0.05, "firsts": (0.2, 0.1), "rounds": 15}
 # faces below which its faces are not followed: 20 degrees.
 _SMOOTHED = 24
 _NOISY = 0.94
+_LOOKED_AT = 2000
 
 
 @dataclass(frozen=True)
@@ -61,15 +63,7 @@ class ProcessField:
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         """The displacement (M, 3) at places (M, 3), normalised frame."""
-        found = np.empty((len(places), 3))
-        # A kernel of r columns for so many rows at once.
-        for first in range(0, len(places), _ROWS):
-            rows = slice(first, first + _ROWS)
-            found[rows] = self.root.at(within_reach(places[rows])) @ self.amplitudes
-        return found
-
-
-_ROWS = 20_000
+        return self.root.field(within_reach(places), self.amplitudes)
 
 
 def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> OrientedPoints:
@@ -87,10 +81,13 @@ def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> O
     corners = surface.vertices[samples.faces_vertices]
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     points = samples.places(surface.vertices)
-    planes, _ = fitted_planes(points, _SMOOTHED)
-    product = np.einsum("nc,nc->n", planes, normals)
+    # They were drawn one independently of the other, so the first say how all are.
+    some = slice(_LOOKED_AT)
+    product = np.einsum("nc,nc->n", fitted_planes(points, _SMOOTHED, some)[0], normals[some])
     if np.median(np.abs(product)) < _NOISY:
-        normals = planes * np.where(product < 0, -1.0, 1.0)[:, None]
+        planes, _ = fitted_planes(points, _SMOOTHED)
+        same_side = np.einsum("nc,nc->n", planes, normals) >= 0
+        normals = planes * np.where(same_side, 1.0, -1.0)[:, None]
     ends = np.zeros(len(surface.vertices), bool)
     ends[rim_edges(surface.faces, len(ends))] = True
     rim = ends[samples.faces_vertices].any(axis=1)
@@ -126,8 +123,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     prior = LinearGaussian.of_kernel(root.root)
     starts = [np.zeros_like(places)]
     if found.field.any():
-        start = ProcessField(root, _fitted(root, found.start, found.field))
-        starts.insert(0, start(places))
+        starts.insert(0, root.root @ _fitted(root.at(found.start), found.field))
     options = _options(settings.overlap)
     if settings.overlap is Overlap.BOTH:
         # Of parts, a loose field would make wholes of each other: first, one that hardly bends.
@@ -135,8 +131,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
         rough = refine_on_surface(
             moving, fixed, starts, stiff, replace(options, **_ROUGHLY), guides
         )
-        start = ProcessField(root, _fitted(root, places, rough.posterior.mean))
-        starts.insert(0, start(places))
+        starts.insert(0, root.root @ _fitted(root.root, rough.posterior.mean))
     end = refine_on_surface(moving, fixed, starts, prior, options, guides)
     posterior = end.posterior
     anywhere = ProcessField(root, posterior.alone)
@@ -177,8 +172,11 @@ def _covered(end: OnSurface, overlap: Overlap) -> tuple[float, tuple[float, floa
     return min(source.unmet, target.unmet), shown, source.beyond
 
 
-def _fitted(root: CovarianceRoot, places: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Amplitudes (r, 3) of the most probable field that is nearly ``field`` (N, 3) at places."""
+def _fitted(kernel: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Amplitudes (r, 3) of the most probable field that is nearly ``field`` (N, 3), of a process
+    whose root at its places is this kernel (N, r)."""
     precision = 1 / _COARSE_ERROR**2
-    every = np.broadcast_to(precision * np.eye(3), (len(places), 3, 3))
-    return Posterior(LinearGaussian.of_kernel(root.at(places)), precision * field, every).alone
+    # The three coordinates do not know of each other, and share a system.
+    system = precision * kernel.T @ kernel
+    system[np.diag_indices_from(system)] += 1
+    return solve(system, precision * kernel.T @ field, assume_a="pos")
