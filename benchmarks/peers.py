@@ -224,7 +224,7 @@ def cases(pairs: Iterator[Pair], model: Model) -> Iterator[Case]:
         seconds = time.process_time() - began
         alignment, frame = result.alignment, result.alignment.frame
         case = Case(
-            Surface(alignment.normalise(source.vertices), source.faces),
+            Surface(alignment.normalise(source.vertices), source.faces, source.name),
             Surface(frame.normalise(target.vertices), target.faces),
             frame.normalise(truth),
             100 * frame.scale / radius(source),
@@ -265,6 +265,10 @@ def options() -> argparse.Namespace:
         help="words in the conditions",
     )
     parser.add_argument("--programs", nargs="+", default=list(PEERS), choices=list(PEERS))
+    parser.add_argument(
+        "--pairs", nargs="+", default=[""], help="words in the names of those wanted"
+    )
+    parser.add_argument("--each", action="store_true", help="a line for every pair, too")
     parser.add_argument("--settings", action="store_true", help="a row for each setting tried")
     return parser.parse_args()
 
@@ -282,7 +286,8 @@ def main() -> None:
         if not any(word in condition for word in chosen.only):
             continue
         kind = next(k for k, words in enumerate(KINDS) if any(word in condition for word in words))
-        few = islice(pairs, 0, None, chosen.every)
+        few = (pair for pair in pairs if any(word in pair[0] for word in chosen.pairs))
+        few = islice(few, 0, None, chosen.every)
         rows: dict[tuple[str, int], list[tuple[float, float]]] = {}
         ours = []
         for case in cases(few, model):
@@ -293,7 +298,11 @@ def main() -> None:
                     continue
                 for number, setting in enumerate(peer.settings):
                     if chosen.settings or number == peer.chosen[kind]:
-                        rows.setdefault((name, number), []).append(tried(peer, setting, case))
+                        found = tried(peer, setting, case)
+                        rows.setdefault((name, number), []).append(found)
+                        if chosen.each:
+                            numbers = [*case.ours, name, number, *found]
+                            print(f"  {condition}, {case.source.name}:", *numbers, flush=True)
         show(condition, np.array(ours), {k: np.array(v) for k, v in rows.items()}, there)
 
 

@@ -16,17 +16,19 @@ from dine.geometry.oriented import evenly
 # A rigid motion must lower the mean squared distance this much, or deformations of round objects
 # would pass for rotations; so must starts at other rotations, or symmetric objects would be turned.
 _MUCH_BETTER = 0.5
-# Where scans overlap: points looked at; distances, in median radii, that count a quarter, at first
-# and last; rounds; how far motions that are the same are apart; and how many are given beside none.
+# Points looked at where scans overlap, and at first of others.
 _FEWER = 400
+# Where scans overlap: distances, in median radii, that count a quarter, at first and last; rounds;
+# how far motions that are the same are apart; and how many are given beside none.
 _WIDE, _NARROW = 0.8, 0.1
 _ROUNDS = 20
 _ALIKE = 0.1
 _TRIED = 3
-# Of iterative closest points, the most rounds, and the change of the mean squared distance at
-# which they end.
-_ITERATIONS = 60
+# The change of the mean squared distance at which iterative closest points end.
 _SETTLED = 1e-7
+# Rounds on few points, and ways round that are then tried on all.
+_FIRST_ROUNDS = 20
+_TURNS = 2
 
 
 def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -190,41 +192,55 @@ def motion_between(a: np.ndarray, b: np.ndarray, weight: np.ndarray | None = Non
     return motion
 
 
+class _ClosestPoints:
+    """Iterative closest points (Besl and McKay, 1992) from (N, 3) points to (M, 3) others."""
+
+    def __init__(self, a: np.ndarray, b: np.ndarray, both_ways: bool):
+        """``both_ways``: how well a motion fits is seen from both."""
+        # In the order of a tree neighbours follow each other, and their neighbours are at hand.
+        self.a, self.b, self.both_ways = a[cKDTree(a).indices], b, both_ways
+        self.tree = cKDTree(b)
+
+    def misfit(self, motion: np.ndarray) -> float:
+        """Mean squared distance to the nearest other point after a 4×4 motion."""
+        moved = transformed(self.a, motion)
+        there = float((self.tree.query(moved)[0] ** 2).mean())
+        if not self.both_ways:
+            return there
+        return there + float((cKDTree(moved).query(self.b)[0] ** 2).mean())
+
+    def best(
+        self, starts: Iterable[np.ndarray], count: int = 1, rounds: int = 60
+    ) -> list[tuple[float, np.ndarray]]:
+        """Misfits and 4×4 motions that some starts lead to, of those that fit best."""
+        found = [self._improved(start, rounds) for start in starts]
+        found = [(self.misfit(motion), motion) for motion in found]
+        return sorted(found, key=lambda one: one[0])[:count]
+
+    def _improved(self, motion: np.ndarray, rounds: int) -> np.ndarray:
+        before = np.inf
+        for _ in range(rounds):
+            closest = self.b[self.tree.query(transformed(self.a, motion))[1]]
+            motion = motion_between(self.a, closest)
+            apart = transformed(self.a, motion) - closest
+            squared = float((apart**2).sum(axis=1).mean())
+            if before - squared < _SETTLED:
+                break
+            before = squared
+        return motion
+
+
 def _motions(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> list[np.ndarray]:
-    tree = cKDTree(b)
-
-    def misfit(matrix: np.ndarray) -> float:
-        moved = transformed(a, matrix)
-        there = float((tree.query(moved)[0] ** 2).mean())
-        return there + float((cKDTree(moved).query(b)[0] ** 2).mean()) if both_ways else there
-
-    def improved(start: np.ndarray) -> tuple[float, np.ndarray]:
-        matrix = _closest_points(a, b, tree, start)
-        return misfit(matrix), matrix
-
-    def best_of(starts: Iterable[np.ndarray]) -> tuple[float, np.ndarray]:
-        return min((improved(start) for start in starts), key=lambda result: result[0])
-
-    best = (misfit(np.eye(4)), np.eye(4))
-    near = best_of([np.eye(4), _between_middles(a, b, np.eye(3))])
+    search = _ClosestPoints(a, b, both_ways)
+    best = (search.misfit(np.eye(4)), np.eye(4))
+    [near] = search.best([np.eye(4), _between_middles(a, b, np.eye(3))])
     if near[0] < _MUCH_BETTER * best[0]:
         best = near
-    turned = best_of(_between_middles(a, b, rotation) for rotation in _between_axes(a, b))
+    turns = [_between_middles(a, b, rotation) for rotation in _between_axes(a, b)]
+    # Which way round is worth a try shows on few points.
+    few = _ClosestPoints(*(points[evenly(points, _FEWER)] for points in (a, b)), both_ways)
+    [turned] = search.best(motion for _, motion in few.best(turns, _TURNS, _FIRST_ROUNDS))
     return [turned[1], best[1]] if turned[0] < _MUCH_BETTER * best[0] else [best[1]]
-
-
-def _closest_points(a: np.ndarray, b: np.ndarray, tree: cKDTree, start: np.ndarray) -> np.ndarray:
-    """The 4×4 motion that iterative closest points lead to from a start (Besl and McKay, 1992), of
-    points (N, 3) and others (M, 3), whose tree this is."""
-    motion, before = start, np.inf
-    for _ in range(_ITERATIONS):
-        closest = b[tree.query(transformed(a, motion))[1]]
-        motion = motion_between(a, closest)
-        apart = float(((transformed(a, motion) - closest) ** 2).sum(axis=1).mean())
-        if before - apart < _SETTLED:
-            break
-        before = apart
-    return motion
 
 
 def _between_middles(a: np.ndarray, b: np.ndarray, rotation: np.ndarray) -> np.ndarray:

@@ -248,7 +248,7 @@ def spread(count: int, some: int) -> np.ndarray:
     """At most ``some`` of the indices below ``count``, the same ones each time."""
     if count <= some:
         return np.arange(count)
-    return np.random.default_rng(6).permutation(count)[:some]
+    return np.sort(np.random.default_rng(6).permutation(count)[:some])
 
 
 class _Search:

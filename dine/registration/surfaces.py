@@ -91,7 +91,8 @@ def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> O
     ends = np.zeros(len(surface.vertices), bool)
     ends[rim_edges(surface.faces, len(ends))] = True
     rim = ends[samples.faces_vertices].any(axis=1)
-    return OrientedPoints(points, normals, rim)
+    # In the order of a tree neighbours follow each other, which makes searches quicker.
+    return OrientedPoints(points, normals, rim).at(cKDTree(points).indices)
 
 
 def rim_of(surface: Surface, spacing: float) -> Curve:
