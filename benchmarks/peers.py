@@ -171,9 +171,9 @@ PEERS = {
         [
             _drift(2.0, 200, 0.1),
             _drift(2.0, 50, 1.0),
+            _drift(2.0, 200, 1.0),
             _drift(1.4, 20, 1.0),
             _drift(1.0, 50, 0.3),
-            _drift(0.7, 50, 0.1),
         ],
         (0, 0, 0),
         "dine",
@@ -184,11 +184,11 @@ PEERS = {
         [
             {"beta": 0.5, "alpha": 64.0},
             {"beta": 0.5, "alpha": 512.0},
-            {"beta": 1.0, "alpha": 8.0},
-            {"beta": 1.0, "alpha": 64.0},
-            {"beta": 0.7, "alpha": 256.0},
+            {"beta": 0.5, "alpha": 2048.0},
+            {"beta": 0.7, "alpha": 1024.0},
+            {"beta": 1.0, "alpha": 256.0},
         ],
-        (0, 0, 0),
+        (2, 1, 2),
         "rustcpd",
         True,
     ),
@@ -199,6 +199,7 @@ class Case(NamedTuple):
     """A pair in the normalised frame of its rigid alignment.
 
     Attributes:
+        name: of the pair.
         source: radius about 1.
         target: likewise.
         truth: (V, 3) where the source's vertices belong.
@@ -206,6 +207,7 @@ class Case(NamedTuple):
         ours: error and CPU seconds of ``dine register``.
     """
 
+    name: str
     source: Surface
     target: Surface
     truth: np.ndarray
@@ -218,13 +220,14 @@ class Case(NamedTuple):
 
 
 def cases(pairs: Iterator[Pair], model: Model) -> Iterator[Case]:
-    for _, source, target, truth in pairs:
+    for name, source, target, truth in pairs:
         began = time.process_time()
         result = register(source, target, model=model)
         seconds = time.process_time() - began
         alignment, frame = result.alignment, result.alignment.frame
         case = Case(
-            Surface(alignment.normalise(source.vertices), source.faces, source.name),
+            name,
+            Surface(alignment.normalise(source.vertices), source.faces),
             Surface(frame.normalise(target.vertices), target.faces),
             frame.normalise(truth),
             100 * frame.scale / radius(source),
@@ -302,7 +305,7 @@ def main() -> None:
                         rows.setdefault((name, number), []).append(found)
                         if chosen.each:
                             numbers = [*case.ours, name, number, *found]
-                            print(f"  {condition}, {case.source.name}:", *numbers, flush=True)
+                            print(f"  {condition}, {case.name}:", *numbers, flush=True)
         show(condition, np.array(ours), {k: np.array(v) for k, v in rows.items()}, there)
 
 
