@@ -106,7 +106,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     stage("surfaces")
     rng = np.random.default_rng([7, settings.seed])
     source, target = (
-        replace(surface, vertices=normalise(surface.vertices))
+        surface.similar(normalise(surface.vertices))
         for surface, normalise in (
             (pair.source, pair.alignment.normalise),
             (pair.target, pair.alignment.frame.normalise),
