@@ -13,9 +13,9 @@ object's radius, mean / median / largest over objects, and median CPU seconds. P
 - ``cpd``: coherent point drift, Myronenko and Song (2010), by rustcpd.
 
 The last two see 4,096 points of the source, of whose field the whole is made by their own kernel,
-and 10,000 and 4,096 of the target. The first two need meshes. Which setting of each is taken was
-chosen by mean errors on every second of the tuned objects: one for small motions, one for large
-ones, and one for sparse clouds.
+and 10,000 and 4,096 of the target. The first two need meshes, and ``nricp`` the package rtree.
+Settings for small motions were chosen on two of the tuned objects (goat's head and malleus); those
+for large motions and for sparse clouds have places of their own, and are guesses so far.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Peer:
 
 
 def _drift(beta: float, lam: float, gamma: float) -> dict[str, Any]:
-    """Of ``bcpd``: with the displacements' mean for their posterior, which never did worse."""
+    """Of ``bcpd``: with the displacements' mean for their posterior."""
     return {"beta": beta, "lam": lam, "gamma": gamma, "uncertain": False}
 
 
