@@ -23,7 +23,7 @@ _FEWER = 400
 _WIDE, _NARROW = 0.8, 0.1
 _ROUNDS = 20
 _ALIKE = 0.1
-_TRIED = 3
+_TRIED = 6
 _ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
 
 
