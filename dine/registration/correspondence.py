@@ -36,8 +36,10 @@ _RETURN = 3.0
 # Points that end so close to each other are the same, and the share of such from which all are.
 _SAME = 1e-9
 _SHARED = 0.5
-# Share of a scan without counterpart from which scans are tried as parts that overlap.
+# Share of the surfaces without counterpart, and shares of both scans past the other's end, from
+# which scans are tried as parts that overlap. What one scan lacks by a hole, the other does not.
 _LACKING = 0.1
+_PAST_THE_END = (0.03, 0.02)
 _AS_WELL = 0.02
 # Where scans overlap: alignments that are carried to the end, no motion and those at most so much
 # less probable as judged by stiff fields; and what a later one must lower the improbability to.
@@ -60,7 +62,7 @@ def correspondence_of(
     pairs = aligned_pairs(source, target, settings, model.convention)
     found = _most_probable(pairs, model, settings)
     may_lie_otherwise = isinstance(settings.prealign, str) and settings.prealign == "auto"
-    if settings.overlap is Overlap.AUTO and may_lie_otherwise and _lacks(found[1]):
+    if settings.overlap is Overlap.AUTO and may_lie_otherwise and lacks(found[1]):
         as_parts = replace(settings, overlap=Overlap.BOTH)
         pairs = aligned_pairs(source, target, as_parts, model.convention)
         parts = _most_probable(pairs, model, as_parts)
@@ -85,11 +87,12 @@ def _check(settings: Settings) -> None:
         )
 
 
-def _lacks(found: Correspondence) -> bool:
-    """Whether much of the surfaces has no counterpart: more than one scan lacks by a hole."""
+def lacks(found: Correspondence) -> bool:
+    """Whether more has no counterpart than one scan lacks by a hole."""
     if found.unmet is None:
         return False
-    parts = min(found.shown) < 1 - _LACKING and max(found.shown) < 1 - _LACKING / 5
+    more, less = _PAST_THE_END
+    parts = min(found.shown) < 1 - more and max(found.shown) < 1 - less
     return parts or found.unmet > _LACKING
 
 

@@ -1,5 +1,7 @@
 """Refinement against surfaces: on what is known to be the answer, and within registrations."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -16,8 +18,10 @@ from dine.io.readers import read_surface
 from dine.io.writers import write_surface
 from dine.refinement.process import SURFACE
 from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
+from dine.registration.correspondence import lacks
 from dine.registration.mirrored import mirrored
 from dine.registration.surfaces import oriented_points
+from dine.registration.types import Correspondence
 
 pytestmark = pytest.mark.numerical
 NO_CURVE = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -123,6 +127,27 @@ def test_parts_that_overlap_come_to_lie_on_each_other(overlapping, overlap):
     assert 0.6 < result.report["supported"] < 0.9
     assert "no counterpart" in " ".join(result.trust.reasons)
     assert result.report["settings"]["overlap"] == overlap
+    # The calibration is of whole scans; of parts it would promise too much.
+    assert result.report["overlap_found"] == "both"
+    assert result.uncertainty is None
+    assert result.trust.verdict == "doubtful"
+    assert ("registered as parts" in " ".join(result.trust.reasons)) == (overlap == "auto")
+
+
+@pytest.mark.parametrize(
+    ("shown", "unmet", "parts"),
+    [
+        ((1.0, 0.8), 0.02, False),  # a hole
+        ((0.986, 1.0), 0.01, False),  # the rim of a face
+        ((0.96, 0.97), 0.02, True),
+        ((1.0, 1.0), 0.12, True),
+    ],
+)
+def test_parts_are_tried_where_both_scans_lack_something(shown, unmet, parts):
+    points = np.zeros((1, 3))
+    found = Correspondence(points, points, points, None, np.ones(1, bool))
+    found = dataclasses.replace(found, shown=shown, unmet=unmet)
+    assert lacks(found) == parts
 
 
 def test_a_source_that_is_a_part_of_its_target(pair):
@@ -244,16 +269,6 @@ def test_an_open_sheet_does_not_shrink_to_be_rid_of_its_rim():
     target = Surface(np.concatenate([truth, middles]), split)
     result = dine.register(sheet, target, prealign="off")
     assert mean_error(result.moved.vertices, truth) < 0.015
-
-
-def test_parts_found_by_auto_are_not_judged_by_what_wholes_taught(overlapping):
-    """The calibration is of whole scans; of parts it would promise too much."""
-    source, target, _, _ = overlapping
-    result = dine.register(source, target)
-    assert result.report["overlap_found"] == "both"
-    assert result.uncertainty is None
-    assert result.trust.verdict == "doubtful"
-    assert "registered as parts" in " ".join(result.trust.reasons)
 
 
 def test_whole_scans_are_judged_by_the_calibration(pair):
