@@ -23,7 +23,7 @@ _FEWER = 400
 _WIDE, _NARROW = 0.8, 0.1
 _ROUNDS = 20
 _ALIKE = 0.1
-_TRIED = 3
+_TRIED = 6
 # The change of the mean squared distance at which iterative closest points end.
 _SETTLED = 1e-7
 # Rounds on few points, and ways round that are then tried on all.

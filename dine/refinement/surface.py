@@ -56,6 +56,9 @@ class SurfaceOptions:
         source_looks: source points look for target points, as they should not where the target
             shows a part of the source.
         target_looks: likewise. Where only one of the scans looks, surfaces end anywhere.
+        parts: each scan shows what the other does not. Where one was cut the other goes on, so rims
+            do not belong on rims, and a match must be the nearest from both sides, roughly: what
+            only one shows would find something of the other wherever that ends.
     """
 
     firsts: tuple[float, ...] = (0.08, 0.2)
@@ -69,6 +72,7 @@ class SurfaceOptions:
     missing: float = 1.0
     source_looks: bool = True
     target_looks: bool = True
+    parts: bool = False
 
     @property
     def both_look(self) -> bool:
@@ -87,6 +91,8 @@ _ROUGHNESS_POINTS = 4000
 _AGREED = 0.01
 # Share of the clear matches whose normals agree from which signs are known.
 _ONE_SIDED = 0.9
+# How much farther than the nearest to its partner a point may be, where scans are parts.
+_RECIPROCAL = 2.0
 
 
 class Outline(NamedTuple):
@@ -271,6 +277,7 @@ class _Search:
         self.asking = spread(len(self.target.points), looking)
         self.spacings = (2 * _spacing(self.target.points), _spacing(self.source.points))
         self.signs = (1.0, -1.0)
+        self.places = cKDTree(self.target.points)
 
     def posterior(
         self, field: np.ndarray, prior: LinearGaussian, schedule: np.ndarray
@@ -283,7 +290,7 @@ class _Search:
     def tell_sides(self, field: np.ndarray) -> None:
         """Find out, where a field (N, 3) brings the source, which normals are the same side's."""
         moved = self.source.points + field[: len(self.source.points)]
-        nearest = cKDTree(self.target.points).query(moved)[1]
+        nearest = self.places.query(moved)[1]
         product = np.einsum("nc,nc->n", self.normals(moved), self.target.normals[nearest])
         clear = np.abs(product) > self.least
         same = (product[clear] > 0).mean() if clear.any() else 0.5
@@ -319,7 +326,7 @@ class _Search:
         agreeing[:count] &= options.source_looks
         agreeing[count:] &= options.target_looks
         # What lies beyond the end of a surface finds its rim, wherever it belongs.
-        beyond = self._beyond(index, matched)
+        beyond = self._beyond(moved, index, matched, deviation)
         agreeing &= ~beyond
         # As much weight for the target's points as for the source's.
         scale = np.ones(len(index))
@@ -369,15 +376,33 @@ class _Search:
         index, matched, ours = self._matches(moved, self.options.turning * deviation)
         _, _, squared, agreeing = self._apart(moved, index, matched, ours)
         met = agreeing & (squared < (self.options.reach * deviation) ** 2)
-        beyond = self._beyond(index, matched) & ~met
+        beyond = self._beyond(moved, index, matched, deviation) & ~met
         return tuple(
             Coverage(met[side], beyond[side]) for side in (slice(count), slice(count, None))
         )
 
-    def _beyond(self, index: np.ndarray, matched: np.ndarray) -> np.ndarray:
-        """Matches (n,), first those that the source looked for, that found where the other ends."""
-        count = len(self.source.points)
-        return np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
+    def _beyond(
+        self, moved: np.ndarray, index: np.ndarray, matched: np.ndarray, deviation: float
+    ) -> np.ndarray:
+        """Matches (n,), first those that the source looked for, that found where the other ends.
+
+        Of parts also those whose point found another that is much nearer to it (reciprocal
+        correspondences: Pajdla and Van Gool, 1995, Matching of 3-D curves using semi-differential
+        invariants).
+        """
+        count = len(moved)
+        beyond = np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
+        if self.options.parts:
+            there = self.target.points[matched]
+            back = np.concatenate(
+                [
+                    cKDTree(moved).query(there[:count])[0],
+                    self.places.query(moved)[0][index[count:]],
+                ]
+            )
+            away = np.linalg.norm(there - moved[index], axis=1)
+            beyond |= away > _RECIPROCAL * back + deviation + self.spacings[1]
+        return beyond
 
     def _matches(
         self, moved: np.ndarray, turning: float
@@ -424,7 +449,8 @@ class _Rims:
     def __init__(self, source: Curve, target: Curve, options: SurfaceOptions):
         self.source, self.target, self.options = source, target, options
         self.tree = cKDTree(target.points)
-        self.off = not (options.both_look and len(target.points) and len(source.points))
+        some = len(target.points) and len(source.points)
+        self.off = options.parts or not (options.both_look and some)
 
     def observed(self, field: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, float]:
         """As of :class:`_Search`, at the rim's points (E, 3)."""

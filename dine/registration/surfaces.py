@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve
@@ -23,7 +25,7 @@ from dine.geometry.oriented import (
 from dine.geometry.surface import Surface
 from dine.priors.gaussian import CovarianceRoot, LinearGaussian
 from dine.progress import stage
-from dine.refinement.process import STIFFER, SURFACE
+from dine.refinement.process import STIFF_AND_BENT, STIFFER, SURFACE
 from dine.refinement.surface import (
     NO_GUIDES,
     OnSurface,
@@ -40,15 +42,31 @@ TARGET_POINTS = 20_000
 _DRAWN = 4
 # Error of a coarse field, which a start that the process allows is fitted to.
 _COARSE_ERROR = 0.01
-# Where scans overlap: what points beyond the other's end cost, against others without counterpart,
-# and how the first, stiff field is found.
+# Where scans overlap: what points beyond the other's end cost, against others without counterpart;
+# how stiff fields are found, each from the one before; and how the search goes on from these.
 _MISSING = 0.2
-_ROUGHLY = {"last": 0.05, "between": 0.05, "firsts": (0.2, 0.1), "rounds": 15}
+_ROUGHLY = ((STIFFER, 0.2, 15), (STIFF_AND_BENT, 0.15, 10))
+_ROUGH_END = 0.05
+_GOING_ON = (0.08, 0.04)
 # Points through which a plane is laid to see how rough a mesh is, and the cosine between planes and
 # faces below which its faces are not followed: 20 degrees.
 _SMOOTHED = 24
 _NOISY = 0.94
 _LOOKED_AT = 2000
+
+
+class Glance(NamedTuple):
+    """How closely rigid alignments are looked at: points of the source and of the target, and the
+    standard deviation that ends it."""
+
+    source: int
+    target: int
+    end: float
+
+
+QUICK = Glance(400, 2000, _ROUGH_END)
+CLOSE = Glance(800, 5000, 0.02)
+_GLANCES = 12
 
 
 @dataclass(frozen=True)
@@ -127,12 +145,15 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
         starts.insert(0, root.root @ _fitted(root.at(found.start), found.field))
     options = _options(settings.overlap)
     if settings.overlap is Overlap.BOTH:
-        # Of parts, a loose field would make wholes of each other: first, one that hardly bends.
-        stiff = LinearGaussian.of_kernel(STIFFER.fitted(places).root)
-        rough = refine_on_surface(
-            moving, fixed, starts, stiff, replace(options, **_ROUGHLY), guides
-        )
-        starts.insert(0, root.root @ _fitted(root.root, rough.posterior.mean))
+        # Of parts, a loose field would make wholes of each other: first, some that hardly bend.
+        field, starts = starts[0], []
+        for process, first, rounds in _ROUGHLY:
+            stiff = LinearGaussian.of_kernel(process.fitted(places).root)
+            roughly = _rough(options, first, rounds)
+            rough = refine_on_surface(moving, fixed, [field], stiff, roughly, guides)
+            field = rough.posterior.mean
+            starts.append(root.root @ _fitted(root.root, field))
+        options = replace(options, firsts=_GOING_ON)
     end = refine_on_surface(moving, fixed, starts, prior, options, guides)
     posterior = end.posterior
     anywhere = ProcessField(root, posterior.alone)
@@ -152,8 +173,42 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     )
 
 
+def _rough(
+    options: SurfaceOptions, first: float, rounds: int, end: float = _ROUGH_END
+) -> SurfaceOptions:
+    return replace(options, firsts=(first,), between=end, last=end, rounds=rounds)
+
+
+def improbabilities(
+    pairs: Sequence[Pair], settings: Settings, glance: Glance = QUICK
+) -> list[float]:
+    """How little each of several alignments of two scans explains: −log of the evidence, up to a
+    constant, of the surfaces and a field that hardly bends, on few points."""
+    rng = np.random.default_rng([8, settings.seed])
+    source, target = (
+        drawn.at(evenly(drawn.points, count))
+        for drawn, count in (
+            (oriented_points(pairs[0].source, _DRAWN * glance.source, rng), glance.source),
+            (oriented_points(pairs[0].target, _DRAWN * glance.target, rng), glance.target),
+        )
+    )
+    none = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
+    options = _rough(_options(settings.overlap), _ROUGHLY[0][1], _GLANCES, glance.end)
+    found = []
+    for pair in pairs:
+        normals = source.normals @ pair.alignment.matrix[:3, :3].T
+        here = source._replace(points=pair.alignment.normalise(source.points), normals=normals)
+        there = target._replace(points=pair.alignment.frame.normalise(target.points))
+        prior = STIFFER.at(here.points)
+        start = np.zeros_like(here.points)
+        end = refine_on_surface(Outline(here, none), Outline(there, none), [start], prior, options)
+        found.append(end.improbability)
+    return found
+
+
 def _options(overlap: Overlap) -> SurfaceOptions:
     return SurfaceOptions(
+        parts=overlap is Overlap.BOTH,
         missing=_MISSING if overlap is Overlap.BOTH else 1.0,
         source_looks=overlap is not Overlap.TARGET_IN_SOURCE,
         target_looks=overlap is not Overlap.SOURCE_IN_TARGET,
