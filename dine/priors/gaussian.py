@@ -37,6 +37,10 @@ class LinearGaussian:
         points = len(kernel)
         return cls(np.zeros((points, 3)), np.zeros((0, points, 3)), kernel)
 
+    def times(self, factor: float) -> LinearGaussian:
+        """With standard deviations so many times as large, around the same mean."""
+        return LinearGaussian(self.mean, factor * self.modes, factor * self.kernel)
+
 
 def squared_exponential(
     a: np.ndarray,
@@ -77,6 +81,12 @@ class CovarianceRoot:
     pivots: np.ndarray
     lower: np.ndarray
     kernel: tuple[Sequence[float], Sequence[float], float]
+
+    def times(self, factor: float) -> CovarianceRoot:
+        """That of a process whose standard deviations are so many times as large."""
+        widths, amplitudes, affine = self.kernel
+        kernel = (widths, [factor * amplitude for amplitude in amplitudes], factor * affine)
+        return CovarianceRoot(factor * self.root, self.pivots, factor * self.lower, kernel)
 
     def at(self, places: np.ndarray) -> np.ndarray:
         """(M, r) rows for any places (M, 3): those of the points themselves at these.
@@ -230,17 +240,22 @@ class Posterior:
         self.complexity = float(np.log(np.diag(self._factor[0])).sum())
 
     @cached_property
+    def determined(self) -> float:
+        """How many amplitudes the data determine (MacKay, 1992, Bayesian interpolation, equation
+        4.10)."""
+        inverse = solve_triangular(
+            self._factor[0], np.eye(len(self._factor[0])), lower=True, check_finite=False
+        )
+        return len(inverse) - float((inverse**2).sum())
+
+    @cached_property
     def scale(self) -> float:
         """Standard deviation, in those of the prior, that amplitudes like these are most likely of.
 
         Squared, it is Σ amplitude² over the number of amplitudes that the data determine (MacKay,
         1992, Bayesian interpolation, equation 4.9).
         """
-        inverse = solve_triangular(
-            self._factor[0], np.eye(len(self._factor[0])), lower=True, check_finite=False
-        )
-        determined = len(inverse) - float((inverse**2).sum())
-        return float(np.sqrt(2 * self.energy / max(determined, 1.0)))
+        return float(np.sqrt(2 * self.energy / max(self.determined, 1.0)))
 
     def covariance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
         """(M, 3, 3) of the field where the prior has these rows of its kernel (M, r), and modes

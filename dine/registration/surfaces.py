@@ -17,6 +17,7 @@ from dine.geometry.oriented import (
     OrientedPoints,
     evenly,
     fitted_planes,
+    fitted_quadrics,
     rim_curve,
     rim_edges,
     rim_points,
@@ -53,6 +54,8 @@ _GOING_ON = (0.08, 0.04)
 _SMOOTHED = 24
 _NOISY = 0.94
 _LOOKED_AT = 2000
+# How often, of whole scans, their noise and the scale of the prior are estimated at the end.
+_SETTLING = 3
 
 
 class Glance(NamedTuple):
@@ -88,12 +91,12 @@ def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> O
     """At most ``count`` points of a surface and its normals there.
 
     Drawn by area from a mesh; of a cloud those that cover it evenly. The faces of a noisy mesh lie
-    every way; planes through neighbours replace them there.
+    every way; planes through neighbours replace them there; of a cloud they are those of quadrics.
     """
     if surface.faces is None:
         points = surface.vertices[near_points(surface.vertices)]
         points = points[evenly(points, count)]
-        normals, _ = fitted_planes(points)
+        normals = fitted_quadrics(points)
         return OrientedPoints(points, normals, rim_points(points, normals))
     samples = sample_surface(surface, count, rng)
     corners = surface.vertices[samples.faces_vertices]
@@ -134,8 +137,9 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     drawn = drawn.at(evenly(drawn.points, SOURCE_POINTS))
     tree = cKDTree(drawn.points)
     spacing = float(np.median(tree.query(drawn.points, k=2)[0][:, 1]))
-    moving = Outline(drawn, rim_of(source, spacing))
-    fixed = Outline(oriented_points(target, TARGET_POINTS, rng), rim_of(target, spacing / 4))
+    moving = Outline(drawn, rim_of(source, spacing), *_measured(source))
+    seen = oriented_points(target, TARGET_POINTS, rng)
+    fixed = Outline(seen, rim_of(target, spacing / 4), *_measured(target))
     guides = settings.guide.within(pair.alignment) if settings.guide else NO_GUIDES
     places = np.vstack([moving.places, guides.places])
     root = SURFACE.fitted(places)
@@ -155,7 +159,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
             starts.append(root.root @ _fitted(root.root, field))
         options = replace(options, firsts=_GOING_ON)
     end = refine_on_surface(moving, fixed, starts, prior, options, guides)
-    posterior = end.posterior
+    posterior, root = end.posterior, root.times(end.scale)
     anywhere = ProcessField(root, posterior.alone)
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
@@ -171,6 +175,17 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
         shown=shown,
         supported=~lacking[nearest],
     )
+
+
+def _measured(surface: Surface) -> tuple[int, float]:
+    """How many points a surface was measured at, and the median distance between those of a cloud;
+    0 of a mesh."""
+    points = surface.vertices
+    if surface.faces is not None:
+        return len(points), 0.0
+    points = points[near_points(points)]
+    some = points[:: max(len(points) // _LOOKED_AT, 1)]
+    return len(points), float(np.median(cKDTree(points).query(some, k=2)[0][:, 1]))
 
 
 def _rough(
@@ -208,6 +223,7 @@ def improbabilities(
 
 def _options(overlap: Overlap) -> SurfaceOptions:
     return SurfaceOptions(
+        settling=_SETTLING if overlap is Overlap.AUTO else 0,
         parts=overlap is Overlap.BOTH,
         missing=_MISSING if overlap is Overlap.BOTH else 1.0,
         source_looks=overlap is not Overlap.TARGET_IN_SOURCE,
