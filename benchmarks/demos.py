@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from dine.models.checkpoint import load_backbone, shipped_weights
-from dine.refinement.refine import ROUNDS, refine
+from dine.refinement.refine import ROUNDS, Options, refine
 from dine.registration.correspondence import predict_and_refine
 
 
@@ -39,7 +39,9 @@ def main() -> None:
         for kind in ("robust_defreg", "deftransnet"):
             backbone, _ = load_backbone(shipped_weights(kind))
             for rounds, what in ((0, "network alone"), (ROUNDS, "refined")):
-                field, _ = predict_and_refine(backbone, source, target, torch.device("cpu"), rounds)
+                field, _ = predict_and_refine(
+                    backbone, source, target, torch.device("cpu"), Options(rounds)
+                )
                 record(f"our {kind}, {what}", field)
         record("refinement without a network", refine(source, target).mean)
     print("| |", " | ".join(names), "|")

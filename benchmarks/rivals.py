@@ -21,7 +21,7 @@ from dine.classical.methods import CLASSICAL
 from dine.data.sampling import sample_surface
 from dine.geometry.frame import Frame
 from dine.models.checkpoint import load_backbone, shipped_weights
-from dine.refinement.refine import ROUNDS
+from dine.refinement.refine import ROUNDS, Options
 from dine.registration.correspondence import predict_and_refine
 
 POINTS = 1024
@@ -35,7 +35,7 @@ def methods() -> dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
         backbone, _ = load_backbone(shipped_weights(kind))
         for rounds, what in ((0, "network"), (ROUNDS, "refined")):
             found[f"{kind}, {what}"] = lambda s, t, b=backbone, r=rounds: predict_and_refine(
-                b, s, t, cpu, r
+                b, s, t, cpu, Options(r)
             )[0]
     return found
 

@@ -6,8 +6,9 @@ T is a similarity transform and v a Gaussian process. Variational Bayes alternat
 belongs to whom, the posterior of v, and T with the variance of the mixture. Names follow the paper:
 y source, x target, v displacement, u = y + v, ν matches of each source point, σ² of the mixture.
 
-Two things make it fast. The kernel matrix is replaced by a root of low rank, which is all that the
-posterior needs; and once the mixture is narrow, only close pairs of points are compared.
+Three things make it fast. The kernel matrix is replaced by a root of low rank, which is all that
+the posterior needs; once the mixture is narrow, only close pairs of points are compared; and while
+it is wide, very many pairs are compared in single precision.
 """
 
 from __future__ import annotations
@@ -28,6 +29,12 @@ from dine.priors.gaussian import covariance_root
 # In standard deviations of the mixture, which weigh e^-18 there, and in units of the source.
 _REACH = 6.0
 _NEAR = 0.3
+# Pairs of points from which densities are in single precision, and what close then means. Squared
+# distances are off by some 1e-6, which is little for mixtures as wide as that.
+_MANY = 2**22
+_NEAR_OF_MANY = 0.1
+_LEAST_EXPONENT = np.float32(-60)
+_BLOCK = 64
 _LEAST_MATCHES = 1e-20
 _LEAST_VARIANCE = 1e-12
 
@@ -210,7 +217,8 @@ def _matched(
 ) -> _Matches:
     """Matches of (N, 3) moved sources, weighted by their shares (N,), and (M, 3) targets."""
     reach = _REACH * math.sqrt(variance)
-    if reach < _NEAR:
+    many = len(moved) * len(x) > _MANY
+    if reach < (_NEAR_OF_MANY if many else _NEAR):
         near = cKDTree(moved).sparse_distance_matrix(tree, reach, output_type="ndarray")
         i, j = near["i"], near["j"]
         density = share[i] * np.exp(near["v"] ** 2 / (-2 * variance))
@@ -222,6 +230,8 @@ def _matched(
             np.bincount(j, probability, len(x)),
             np.stack(pulled, axis=1),
         )
+    if many:
+        return _matched_of_many(moved, x, variance, share, outlier)
     density = cdist(moved, x, "sqeuclidean")
     density /= -2 * variance
     np.exp(density, out=density)
@@ -229,6 +239,29 @@ def _matched(
     of_target = np.maximum(density.sum(axis=0) + outlier, np.finfo(float).tiny)
     density /= of_target
     return _Matches(density.sum(axis=1), density.sum(axis=0), density @ x)
+
+
+def _matched_of_many(
+    moved: np.ndarray, x: np.ndarray, variance: float, share: np.ndarray, outlier: float
+) -> _Matches:
+    """As :func:`_matched`, in single precision."""
+    # One product gives the exponents: −‖m − x‖² / 2σ².
+    rows = np.column_stack([moved / variance, (moved**2).sum(axis=1) / (-2 * variance)])
+    rows = np.column_stack([rows, np.ones(len(moved))]).astype(np.float32)
+    columns = np.vstack([x.T, np.ones(len(x)), (x**2).sum(axis=1) / (-2 * variance)])
+    columns = columns.astype(np.float32)
+    density = np.empty((len(moved), len(x)), np.float32)
+    for first in range(0, len(moved), _BLOCK):
+        block = density[first : first + _BLOCK]
+        np.matmul(rows[first : first + _BLOCK], columns, out=block)
+        # Numbers below 1e-38 would be slow.
+        np.clip(block, _LEAST_EXPONENT, 0, out=block)
+        np.exp(block, out=block)
+    explained = (share.astype(np.float32) @ density).astype(np.float64)
+    of_target = explained + outlier
+    weighted = np.column_stack([x, np.ones(len(x))]) / of_target[:, None]
+    drawn = share[:, None] * (density @ weighted.astype(np.float32))
+    return _Matches(drawn[:, 3], explained / of_target, drawn[:, :3])
 
 
 def _similarity(

@@ -77,13 +77,7 @@ def sample_surface(surface: Surface, points: int, rng: np.random.Generator) -> S
             np.repeat(index[:, None], 3, axis=1), np.tile([1.0, 0, 0], (points, 1))
         )
 
-    used = surface.vertices[surface.used]
-    low = used.min(axis=0)
-    # Unit size keeps areas of objects in nanometres, or in light years, within float64.
-    size = np.ptp(used, axis=0).max()
-    corners = ((surface.vertices - low) / (size or 1.0))[surface.faces]
-    edges = corners[:, 1:] - corners[:, :1]
-    reach = np.cumsum(np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
+    reach = surface.area_reach
     if not reach[-1] > np.finfo(np.float64).tiny:
         raise DataError(
             f"{surface.name}: the {len(surface.faces)} triangles have no area to draw points from; "

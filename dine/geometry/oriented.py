@@ -13,9 +13,15 @@ NEIGHBOURS = 12
 # Neighbours on the other side of a thin wall do not say how this side lies.
 _SAME_SIDE = 0.3
 _REGULAR = 1e-6
+# Points that a quadric is laid through, and how far its curvatures are held down: as shares of the
+# weight of the points, or of the slopes where points move.
+_THROUGH = 10
+_HELD = 0.01
+_HELD_MOVING = 0.001
 # Neighbours of a point, and the angle in degrees that they leave open at the end of a surface.
 _AROUND = 20
 _OPEN = 140.0
+_EVERYWHERE = slice(None)
 
 
 class OrientedPoints(NamedTuple):
@@ -59,18 +65,49 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def fitted_planes(
-    points: np.ndarray, neighbours: int = NEIGHBOURS
+    points: np.ndarray, neighbours: int = NEIGHBOURS, at: np.ndarray | slice = _EVERYWHERE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Unit normals (N, 3) of a cloud (N, 3), of arbitrary signs, and how rough it is there (N,).
+    """Unit normals (M, 3) of a cloud (N, 3), of arbitrary signs, and how rough it is there (M,), at
+    all of its points or those of the index ``at``.
 
     The normal is the direction in which the neighbours of a point vary least, the roughness their
     standard deviation in it. Hoppe et al. (1992), Surface reconstruction from unorganized points.
     """
-    near = points[_nearest(points, neighbours)]
+    near = points[_nearest(points, neighbours, at)]
     offset = near - near.mean(axis=1, keepdims=True)
     moments = np.einsum("nka,nkb->nab", offset, offset) / near.shape[1]
     variances, axes = np.linalg.eigh(moments)
     return axes[:, :, 0], np.sqrt(np.maximum(variances[:, 0], 0))
+
+
+def fitted_quadrics(points: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of a cloud (N, 3) where quadrics through the neighbours of each point lie
+    on it, of arbitrary signs.
+
+    Neighbours on one side of a point tilt a plane through them where the surface bends; a quadric
+    bends along. Cazals and Pouget (2005), Estimating differential quantities using polynomial
+    fitting of osculating jets; curvatures are held down a little, which few neighbours need.
+    """
+    normals, _ = fitted_planes(points)
+    offset = points[_nearest(points, _THROUGH)] - points[:, None]
+    squared = (offset**2).sum(axis=2)
+    size = np.sqrt(np.maximum(squared.max(axis=1), 1e-20))
+    weight = np.exp(-2 * squared / size[:, None] ** 2)
+    # Once for the axes that they are heights above, and once from there.
+    for _ in range(2):
+        first, second = _tangents(normals)
+        u, v, height = (
+            np.einsum("nkc,nc->nk", offset, axis) / size[:, None]
+            for axis in (first, second, normals)
+        )
+        terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
+        system = np.einsum("nka,nk,nkb->nab", terms, weight, terms)
+        held = np.diag([0, 0, 0, _HELD, _HELD, _HELD]) + 1e-9 * np.eye(6)
+        system += held * weight.sum(axis=1)[:, None, None]
+        right = np.einsum("nka,nk,nk->na", terms, weight, height)
+        slope = np.linalg.solve(system, right[:, :, None])[:, 1:3, 0]
+        normals = unit(normals - slope[:, :1] * first - slope[:, 1:] * second)
+    return normals
 
 
 def rim_points(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -91,10 +128,11 @@ def rim_points(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return gap.max(axis=1) > np.radians(_OPEN)
 
 
-def _nearest(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices (N, k) of the points that are nearest to each, itself first; k is at most N."""
+def _nearest(points: np.ndarray, count: int, at: np.ndarray | slice = _EVERYWHERE) -> np.ndarray:
+    """Indices (M, k) of the points that are nearest to each of some, itself first; k is at most
+    N."""
     count = min(count, len(points))
-    return cKDTree(points).query(points, k=[*range(1, count + 1)])[1]
+    return cKDTree(points).query(points[at], k=[*range(1, count + 1)])[1]
 
 
 def rim_edges(faces: np.ndarray, count: int) -> np.ndarray:
@@ -153,23 +191,25 @@ class MovingNormals:
     Called with the moved points (N, 3): two tangents of each are least-squares combinations of the
     offsets to its neighbours, found once, and their cross product is the normal, with the sign of
     the one given.
+
+    Args:
+        oriented: the points.
+        neighbours: of each.
+        curved: the slopes are those of quadrics through the neighbours and not of planes, which
+            says more where few points show how the surface bends.
     """
 
-    def __init__(self, oriented: OrientedPoints, neighbours: int = 16):
+    def __init__(self, oriented: OrientedPoints, neighbours: int = 16, curved: bool = False):
         points, normals = oriented.points, oriented.normals
         count = len(points)
         near = cKDTree(points).query(points, k=[*range(2, min(neighbours, count - 1) + 2)])[1]
-        first, second = _tangents(normals)
         offset = points[near] - points[:, None]
         same = np.einsum("nkc,nc->nk", normals[near], normals)
         weight = (same > _SAME_SIDE) / np.maximum((offset**2).sum(axis=2), 1e-12)
         along = np.stack(
-            [np.einsum("nkc,nc->nk", offset, axis) for axis in (first, second)], axis=2
+            [np.einsum("nkc,nc->nk", offset, axis) for axis in _tangents(normals)], axis=2
         )
-        system = np.einsum("nka,nk,nkb->nab", along, weight, along)
-        spread = np.trace(system, axis1=1, axis2=2)[:, None, None]
-        system += (_REGULAR * spread + 1e-12) * np.eye(2)
-        slopes = np.einsum("nka,nk,nab->nkb", along, weight, np.linalg.inv(system))
+        slopes = _slopes(along, weight, curved)
         rows = np.repeat(np.arange(count), near.shape[1])
         self._operators = []
         for axis in range(2):
@@ -191,3 +231,18 @@ def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     flat = np.abs(normals[:, :1]) < 0.9
     first = unit(np.cross(normals, np.where(flat, [[1.0, 0, 0]], [[0, 1.0, 0]])))
     return first, np.cross(normals, first)
+
+
+def _slopes(along: np.ndarray, weight: np.ndarray, curved: bool) -> np.ndarray:
+    """(N, k, 2): what the values at the neighbours of each point, at (N, k, 2) places along the
+    surface from it and of weights (N, k), count for the two slopes of a value at the point."""
+    terms, held = along, np.zeros(2)
+    if curved:
+        size = np.maximum(np.abs(along).max(axis=(1, 2)), 1e-12)[:, None]
+        u, v = along[:, :, 0], along[:, :, 1]
+        terms = np.stack([u, v, u * u / size, u * v / size, v * v / size], axis=2)
+        held = np.array([0, 0, *3 * [_HELD_MOVING]])
+    system = np.einsum("nka,nk,nkb->nab", terms, weight, terms)
+    spread = np.trace(system[:, :2, :2], axis1=1, axis2=2)[:, None, None]
+    system += (_REGULAR * spread + 1e-12) * np.eye(len(held)) + spread * np.diag(held)
+    return np.einsum("nka,nk,nab->nkb", terms, weight, np.linalg.inv(system)[:, :, :2])

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh.registration
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -17,14 +16,19 @@ from dine.geometry.oriented import evenly
 # A rigid motion must lower the mean squared distance this much, or deformations of round objects
 # would pass for rotations; so must starts at other rotations, or symmetric objects would be turned.
 _MUCH_BETTER = 0.5
-# Where scans overlap: points looked at; distances, in median radii, that count a quarter, at first
-# and last; rounds; how far motions that are the same are apart; and how many are given beside none.
+# Points looked at where scans overlap, and at first of others.
 _FEWER = 400
+# Where scans overlap: distances, in median radii, that count a quarter, at first and last; rounds;
+# how far motions that are the same are apart; and how many are given beside none.
 _WIDE, _NARROW = 0.8, 0.1
 _ROUNDS = 20
 _ALIKE = 0.1
-_TRIED = 3
-_ICP = {"max_iterations": 60, "threshold": 1e-7, "scale": False, "reflection": False}
+_TRIED = 6
+# The change of the mean squared distance at which iterative closest points end.
+_SETTLED = 1e-7
+# Rounds on few points, and ways round that are then tried on all.
+_FIRST_ROUNDS = 20
+_TURNS = 2
 
 
 def transformed(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -102,7 +106,7 @@ def rigid_alignments(
     The one that fits best comes first. A second one turns the source less: what was deformed much
     can fit better the wrong way round, which shows only once it is deformed back.
 
-    Iterative closest points (trimesh) from where the points are, from coinciding middles, and from
+    Iterative closest points from where the points are, from coinciding middles, and from
     coinciding principal axes; the last are taken only if they fit much better, since a symmetric
     object fits about as well the wrong way round. The identity is kept unless something fits much
     better.
@@ -176,35 +180,66 @@ def _robust(
 def motion_between(a: np.ndarray, b: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray:
     """The 4×4 rigid motion of least squared distances, weighted by (n,), of corresponding points
     (n, 3), which do not lie on a line (Kabsch)."""
-    # trimesh's procrustes takes weights for the middles alone, not for the rotation.
-    middles = [np.average(points, axis=0, weights=weight) for points in (a, b)]
-    turn, _ = Rotation.align_vectors(b - middles[1], a - middles[0], weights=weight)
+    share = np.full(len(a), 1 / len(a)) if weight is None else weight / weight.sum()
+    middle, other = share @ a, share @ b
+    cross = (b - other).T @ (share[:, None] * (a - middle))
+    left, _, right = np.linalg.svd(cross)
+    # The last axis is turned where a mirror image would fit better.
+    left[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
     motion = np.eye(4)
-    motion[:3, :3] = turn.as_matrix()
-    motion[:3, 3] = middles[1] - motion[:3, :3] @ middles[0]
+    motion[:3, :3] = left @ right
+    motion[:3, 3] = other - motion[:3, :3] @ middle
     return motion
 
 
+class _ClosestPoints:
+    """Iterative closest points (Besl and McKay, 1992) from (N, 3) points to (M, 3) others."""
+
+    def __init__(self, a: np.ndarray, b: np.ndarray, both_ways: bool):
+        """``both_ways``: how well a motion fits is seen from both."""
+        # In the order of a tree neighbours follow each other, and their neighbours are at hand.
+        self.a, self.b, self.both_ways = a[cKDTree(a).indices], b, both_ways
+        self.tree = cKDTree(b)
+
+    def misfit(self, motion: np.ndarray) -> float:
+        """Mean squared distance to the nearest other point after a 4×4 motion."""
+        moved = transformed(self.a, motion)
+        there = float((self.tree.query(moved)[0] ** 2).mean())
+        if not self.both_ways:
+            return there
+        return there + float((cKDTree(moved).query(self.b)[0] ** 2).mean())
+
+    def best(
+        self, starts: Iterable[np.ndarray], count: int = 1, rounds: int = 60
+    ) -> list[tuple[float, np.ndarray]]:
+        """Misfits and 4×4 motions that some starts lead to, of those that fit best."""
+        found = [self._improved(start, rounds) for start in starts]
+        found = [(self.misfit(motion), motion) for motion in found]
+        return sorted(found, key=lambda one: one[0])[:count]
+
+    def _improved(self, motion: np.ndarray, rounds: int) -> np.ndarray:
+        before = np.inf
+        for _ in range(rounds):
+            closest = self.b[self.tree.query(transformed(self.a, motion))[1]]
+            motion = motion_between(self.a, closest)
+            apart = transformed(self.a, motion) - closest
+            squared = float((apart**2).sum(axis=1).mean())
+            if before - squared < _SETTLED:
+                break
+            before = squared
+        return motion
+
+
 def _motions(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> list[np.ndarray]:
-    tree = cKDTree(b)
-
-    def misfit(matrix: np.ndarray) -> float:
-        moved = transformed(a, matrix)
-        there = float((tree.query(moved)[0] ** 2).mean())
-        return there + float((cKDTree(moved).query(b)[0] ** 2).mean()) if both_ways else there
-
-    def improved(start: np.ndarray) -> tuple[float, np.ndarray]:
-        matrix, _, _ = trimesh.registration.icp(a, b, initial=start, **_ICP)
-        return misfit(matrix), matrix
-
-    def best_of(starts: Iterable[np.ndarray]) -> tuple[float, np.ndarray]:
-        return min((improved(start) for start in starts), key=lambda result: result[0])
-
-    best = (misfit(np.eye(4)), np.eye(4))
-    near = best_of([np.eye(4), _between_middles(a, b, np.eye(3))])
+    search = _ClosestPoints(a, b, both_ways)
+    best = (search.misfit(np.eye(4)), np.eye(4))
+    [near] = search.best([np.eye(4), _between_middles(a, b, np.eye(3))])
     if near[0] < _MUCH_BETTER * best[0]:
         best = near
-    turned = best_of(_between_middles(a, b, rotation) for rotation in _between_axes(a, b))
+    turns = [_between_middles(a, b, rotation) for rotation in _between_axes(a, b)]
+    # Which way round is worth a try shows on few points.
+    few = _ClosestPoints(*(points[evenly(points, _FEWER)] for points in (a, b)), both_ways)
+    [turned] = search.best(motion for _, motion in few.best(turns, _TURNS, _FIRST_ROUNDS))
     return [turned[1], best[1]] if turned[0] < _MUCH_BETTER * best[0] else [best[1]]
 
 

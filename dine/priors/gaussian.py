@@ -7,8 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
 from scipy.spatial.distance import cdist
+
+_ROWS = 512
+# Solutions of a system in single precision until its error is that of double precision.
+_REFINEMENTS = 2
+_RESIDUE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,10 @@ class LinearGaussian:
         points = len(kernel)
         return cls(np.zeros((points, 3)), np.zeros((0, points, 3)), kernel)
 
+    def times(self, factor: float) -> LinearGaussian:
+        """With standard deviations so many times as large, around the same mean."""
+        return LinearGaussian(self.mean, factor * self.modes, factor * self.kernel)
+
 
 def squared_exponential(
     a: np.ndarray,
@@ -46,9 +55,14 @@ def squared_exponential(
     on top of a random affine one, all in the units of the points.
     """
     squared = cdist(a, b, "sqeuclidean")
-    total = affine**2 * (a @ b.T + 1)
+    total = a @ b.T
+    total += 1
+    total *= affine**2
     for width, amplitude in zip(widths, amplitudes, strict=True):
-        total += amplitude**2 * np.exp(squared / (-2 * width**2))
+        part = squared / (-2 * width**2)
+        np.exp(part, out=part)
+        part *= amplitude**2
+        total += part
     return total
 
 
@@ -68,6 +82,12 @@ class CovarianceRoot:
     lower: np.ndarray
     kernel: tuple[Sequence[float], Sequence[float], float]
 
+    def times(self, factor: float) -> CovarianceRoot:
+        """That of a process whose standard deviations are so many times as large."""
+        widths, amplitudes, affine = self.kernel
+        kernel = (widths, [factor * amplitude for amplitude in amplitudes], factor * affine)
+        return CovarianceRoot(factor * self.root, self.pivots, factor * self.lower, kernel)
+
     def at(self, places: np.ndarray) -> np.ndarray:
         """(M, r) rows for any places (M, 3): those of the points themselves at these.
 
@@ -76,6 +96,18 @@ class CovarianceRoot:
         """
         covariance = squared_exponential(places, self.pivots, *self.kernel)
         return solve_triangular(self.lower, covariance.T, lower=True, check_finite=False).T
+
+    def field(self, places: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
+        """``at(places) @ amplitudes`` (M, k) for amplitudes (r, k), in M · r operations."""
+        at_pivots = solve_triangular(
+            self.lower, amplitudes, lower=True, trans="T", check_finite=False
+        )
+        found = np.empty((len(places), amplitudes.shape[1]))
+        # The covariance of so many rows stays in cache.
+        for first in range(0, len(places), _ROWS):
+            rows = slice(first, first + _ROWS)
+            found[rows] = squared_exponential(places[rows], self.pivots, *self.kernel) @ at_pivots
+        return found
 
 
 def covariance_root(
@@ -109,6 +141,55 @@ def covariance_root(
         left = np.maximum(left - root[:, column] ** 2, 0)
         pivots.append(pivot)
     return CovarianceRoot(root, points[pivots], root[pivots], (widths, amplitudes, affine))
+
+
+def most_probable(prior: LinearGaussian, pulled: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """The mean (N, 3) of :class:`Posterior` alone, in half the time, to some 1e-6 of its length.
+
+    The system is summed up in single precision, and what its solution leaves over is solved for
+    once more (iterative refinement; Higham, 2002, Accuracy and stability of numerical algorithms,
+    chapter 12).
+    """
+    if len(prior.modes) or prior.mean.any():
+        return Posterior(prior, pulled, precision).mean
+    kernel = prior.kernel
+    size = kernel.shape[1]
+    single = kernel.astype(np.float32)
+    # Columns lie one after the other, as the factorisation wants them.
+    system = np.zeros((3 * size, 3 * size), np.float32, order="F")
+    for a in range(3):
+        for b in range(a + 1):
+            block = _weighted_gram(single, precision[:, a, b])
+            system[a * size : (a + 1) * size, b * size : (b + 1) * size] = block.T
+    system[np.diag_indices(len(system))] += 1
+    try:
+        factor = cho_factor(system, lower=True, overwrite_a=True, check_finite=False)
+    except LinAlgError:
+        return Posterior(prior, pulled, precision).mean
+    right = kernel.T @ pulled
+    alone, left = np.zeros_like(right), right
+    for _ in range(_REFINEMENTS):
+        step = cho_solve(factor, left.T.ravel().astype(np.float32), check_finite=False)
+        alone += step.reshape(3, size).T
+        seen = np.einsum("nab,nb->na", precision, kernel @ alone)
+        left = right - kernel.T @ seen - alone
+    # Too near to singular for single precision.
+    if not np.linalg.norm(left) <= _RESIDUE * np.linalg.norm(right):
+        return Posterior(prior, pulled, precision).mean
+    return kernel @ alone
+
+
+def _weighted_gram(kernel: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """(r, r) Σ weight · row · rowᵀ over rows (N, r), whose weights may be negative."""
+    # A product of a matrix with itself takes half the time of one with another.
+    order = np.argsort(weight < 0, kind="stable")
+    rows = kernel[order]
+    rows *= np.sqrt(np.abs(weight[order])).astype(kernel.dtype)[:, None]
+    more, less = np.split(rows, [int((weight >= 0).sum())])
+    total = more.T @ more
+    if len(less):
+        total -= less.T @ less
+    return total
 
 
 class Posterior:
@@ -159,17 +240,22 @@ class Posterior:
         self.complexity = float(np.log(np.diag(self._factor[0])).sum())
 
     @cached_property
+    def determined(self) -> float:
+        """How many amplitudes the data determine (MacKay, 1992, Bayesian interpolation, equation
+        4.10)."""
+        inverse = solve_triangular(
+            self._factor[0], np.eye(len(self._factor[0])), lower=True, check_finite=False
+        )
+        return len(inverse) - float((inverse**2).sum())
+
+    @cached_property
     def scale(self) -> float:
         """Standard deviation, in those of the prior, that amplitudes like these are most likely of.
 
         Squared, it is Σ amplitude² over the number of amplitudes that the data determine (MacKay,
         1992, Bayesian interpolation, equation 4.9).
         """
-        inverse = solve_triangular(
-            self._factor[0], np.eye(len(self._factor[0])), lower=True, check_finite=False
-        )
-        determined = len(inverse) - float((inverse**2).sum())
-        return float(np.sqrt(2 * self.energy / max(determined, 1.0)))
+        return float(np.sqrt(2 * self.energy / max(self.determined, 1.0)))
 
     def covariance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
         """(M, 3, 3) of the field where the prior has these rows of its kernel (M, r), and modes

@@ -165,12 +165,18 @@ class Mixture:
         return self.most_probable(value, precision)
 
     def rounds(
-        self, field: np.ndarray, rounds: int, variance: float | None = None
+        self,
+        field: np.ndarray,
+        rounds: int,
+        variance: float | None = None,
+        *,
+        only_half: bool = False,
     ) -> tuple[Estimate, Estimate]:
         """The fields after half of the rounds and after all, and how badly they explain targets.
 
         That is −log p(targets | field) − log p(field) up to a constant. The variance of the
-        distances is estimated from the start where it is not given.
+        distances is estimated from the start where it is not given. With ``only_half`` the second
+        half is left out, and the second field of no meaning.
         """
         axis, source, least = self.axis, self.source, self.least**2
         squared = self._squared(source + field)
@@ -186,6 +192,7 @@ class Mixture:
             improbability = energy - float(np.log(likelihood).sum())
             if number == rounds // 2:
                 half = Estimate(last, variance, improbability)
+                settled |= only_half
             if settled or number == rounds:
                 break
             share = (factor / likelihood).astype(np.float32)

@@ -52,6 +52,7 @@ class Smoothness(NamedTuple):
 # pretraining data.
 STIFF = Smoothness((1.5, 0.4), (0.2, 0.04), 0.05, 0.01, 128)
 LOOSE = Smoothness((1.5, 0.4, 0.25), (0.5, 0.2, 0.04), 0.5, 0.004, 200)
-# Both on every second of 23 real shapes with synthetic deformations (benchmarks/surfaces.py).
+# These on every second of 23 real shapes with synthetic deformations (benchmarks/surfaces.py).
 STIFFER = Smoothness((1.5, 0.5), (0.1, 0.02), 0.05, 0.01, 128)
+STIFF_AND_BENT = Smoothness((1.5, 0.5), (0.2, 0.05), 0.1, 0.01, 128)
 SURFACE = Smoothness((1.5, 0.5, 0.25), (0.5, 0.2, 0.04), 0.3, 0.004, 300, 1e-5)

@@ -60,10 +60,13 @@ class Options:
             two scans, keep the field of the first half. With 0 the observed field is smoothed only.
         part: the source is a part of what the target shows. Every source point then looks for
             targets; otherwise every target looks for source points, which would stretch the part.
+        shared: source and target may hold the same points, which is looked for. Points drawn on two
+            meshes never do; then the rounds end with the first half.
     """
 
     rounds: int = ROUNDS
     part: bool = False
+    shared: bool = True
 
 
 DEFAULTS = Options()
@@ -104,9 +107,10 @@ def refine(
             if options.rounds == 0:
                 return Refined(smoothed)
             starts.insert(0, smoothed)
-        searched = [stiff.rounds(start, options.rounds) for start in starts]
+        alone = prior is None and (options.part or not options.shared)
+        searched = [stiff.rounds(start, options.rounds, only_half=alone) for start in starts]
         early = min((half for half, _ in searched), key=lambda half: half.improbability)
-        if options.part and prior is None:
+        if alone:
             return Refined(early.field)
         ends = [end for _, end in searched]
         field, share = _finished(source, target, ends, prior or LOOSE.at(source), options)

@@ -32,7 +32,7 @@ from dine.geometry.oriented import (
     fitted_planes,
     unit,
 )
-from dine.priors.gaussian import LinearGaussian, Posterior
+from dine.priors.gaussian import LinearGaussian, Posterior, most_probable
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,9 @@ class SurfaceOptions:
             from every start.
         between: the same where the most probable of the fields found so far is taken.
         last: the same at the end, or the roughness of the target where that is more.
+        finest: the least that it may fall to once it is estimated.
+        settling: how many times, at the end, it and the prior's scale are estimated from what was
+            found.
         rounds: of matching and solving, as many for each part of the search; the standard deviation
             falls geometrically.
         along: precision of a match along the surface. It only damps: more holds slides up, and
@@ -56,11 +59,16 @@ class SurfaceOptions:
         source_looks: source points look for target points, as they should not where the target
             shows a part of the source.
         target_looks: likewise. Where only one of the scans looks, surfaces end anywhere.
+        parts: each scan shows what the other does not. Where one was cut the other goes on, so rims
+            do not belong on rims, and a match must be the nearest from both sides, roughly: what
+            only one shows would find something of the other wherever that ends.
     """
 
     firsts: tuple[float, ...] = (0.08, 0.2)
     between: float = 0.03
     last: float = 0.004
+    finest: float = 0.003
+    settling: int = 0
     rounds: int = 20
     along: float = 1.0
     reach: float = 3.0
@@ -69,6 +77,7 @@ class SurfaceOptions:
     missing: float = 1.0
     source_looks: bool = True
     target_looks: bool = True
+    parts: bool = False
 
     @property
     def both_look(self) -> bool:
@@ -81,10 +90,24 @@ DEFAULTS = SurfaceOptions()
 # source, columns of the prior's kernel. Of the one that goes on so many look.
 _FEWER_POINTS, _FEWER_TARGETS, _FEWER_LOOKING, _FEWER_COLUMNS = 1000, 5000, 2000, 150
 _LOOKING = 8000
+# Points at which the roughness of the target is looked at.
+_ROUGHNESS_POINTS = 4000
 # Mean distance of fields that are the same.
 _AGREED = 0.01
 # Share of the clear matches whose normals agree from which signs are known.
 _ONE_SIDED = 0.9
+# How much farther than the nearest to its partner a point may be, where scans are parts.
+_RECIPROCAL = 2.0
+# Standard deviation over the median distance from the mean, of a Gaussian.
+_TO_DEVIATION = 1.4826
+# Rounds after each estimate; its limits: a standard deviation, shares of the prior's scale, and the
+# share of the observations that the field is taken to follow at most.
+_SETTLING_ROUNDS = 3
+_COARSEST = 0.05
+_SCALES = (0.1, 1.0)
+_FOLLOWED = 0.8
+# Median distances to the next point of a cloud that count as how far off its planes are half way.
+_BETWEEN = 0.8
 
 
 class Outline(NamedTuple):
@@ -93,10 +116,15 @@ class Outline(NamedTuple):
     Attributes:
         surface: (N, 3) points of it.
         rim: (E, 3) points of the curve that it ends at; E may be 0.
+        measured: how many points it was measured at, if that is known: those drawn on the faces
+            between them say nothing new.
+        gaps: median distance between the points of a cloud; 0 of a mesh, whose faces are known.
     """
 
     surface: OrientedPoints
     rim: Curve
+    measured: int | None = None
+    gaps: float = 0.0
 
     @property
     def places(self) -> np.ndarray:
@@ -153,12 +181,14 @@ class OnSurface(NamedTuple):
         improbability: −log of its evidence: misfit + energy + complexity.
         source: which of the source's points lie on the target.
         target: which of the target's points, of those that look for the source, lie on it.
+        scale: the posterior's prior has so many times the standard deviations of the one given.
     """
 
     posterior: Posterior
     improbability: float
     source: Coverage
     target: Coverage
+    scale: float = 1.0
 
 
 def refine_on_surface(
@@ -174,7 +204,8 @@ def refine_on_surface(
     Fields are found from every start, and with every first standard deviation until all starts lead
     to the same, on fewer points; the most probable of them goes on on all. Where the matches are
     more probable if nothing but the prior's mean happened, that is kept: what is left then follows
-    from where points happened to be drawn.
+    from where points happened to be drawn. Otherwise what is found may settle: see
+    :class:`SurfaceOptions`.
 
     Args:
         source: points spread evenly.
@@ -185,8 +216,9 @@ def refine_on_surface(
         guides: observed as they are, in every round.
     """
     # Neither noise nor what planes through neighbours miss of a curved surface is to be followed.
-    rough = float(np.median(fitted_planes(target.surface.points)[1]))
-    last = max(options.last, rough)
+    some = spread(len(target.surface.points), _ROUGHNESS_POINTS)
+    rough = float(np.median(fitted_planes(target.surface.points, at=some)[1]))
+    last = max(options.last, rough, _BETWEEN * max(source.gaps, target.gaps))
     between = max(options.between, last)
     search = _Search(source, target, options, _LOOKING, guides)
     search.tell_sides(starts[0])
@@ -197,10 +229,15 @@ def refine_on_surface(
         end = search.posterior(start, prior, np.geomspace(between, last, options.rounds))
         improbability = search.observed(end.mean, last)[2] + end.energy + end.complexity
         _, precision, misfit = search.observed(prior.mean, last)
+        scale = 1.0
         if misfit < improbability:
             still = np.einsum("nab,nb->na", precision, prior.mean)
             end, improbability = Posterior(prior, still, precision), misfit
-    return OnSurface(end, improbability, *search.coverage(end.mean, last))
+        elif options.settling:
+            # Settled fields, each judged by what it says itself, could not be compared.
+            known = [x.measured for x in (source, target) if x.measured is not None]
+            end, scale, last = search.settled(end, prior, last, min(known, default=None))
+    return OnSurface(end, improbability, *search.coverage(end.mean, last), scale)
 
 
 def _fields(
@@ -217,8 +254,10 @@ def _fields(
     inside = evenly(source.surface.points, _FEWER_POINTS)
     rim = np.arange(0, len(source.rim.points), 2)
     few = _Search(
-        Outline(source.surface.at(inside), source.rim.at(rim)),
-        Outline(target.surface.at(spread(len(target.surface.points), _FEWER_TARGETS)), target.rim),
+        source._replace(surface=source.surface.at(inside), rim=source.rim.at(rim)),
+        target._replace(
+            surface=target.surface.at(spread(len(target.surface.points), _FEWER_TARGETS))
+        ),
         search.options,
         _FEWER_LOOKING,
         search.guides,
@@ -245,7 +284,7 @@ def spread(count: int, some: int) -> np.ndarray:
     """At most ``some`` of the indices below ``count``, the same ones each time."""
     if count <= some:
         return np.arange(count)
-    return np.random.default_rng(6).permutation(count)[:some]
+    return np.sort(np.random.default_rng(6).permutation(count)[:some])
 
 
 class _Search:
@@ -263,25 +302,59 @@ class _Search:
         self.guides = guides
         self.source, self.target, self.options = source.surface, target.surface, options
         self.rims = _Rims(source.rim, target.rim, options)
-        self.normals = MovingNormals(self.source)
+        self.from_cloud = max(source.gaps, target.gaps) > 0
+        self.normals = MovingNormals(self.source, curved=source.gaps > 0)
         self.least = np.cos(np.radians(options.steepest))
         self.asking = spread(len(self.target.points), looking)
         self.spacings = (2 * _spacing(self.target.points), _spacing(self.source.points))
         self.signs = (1.0, -1.0)
+        self.places = cKDTree(self.target.points)
 
     def posterior(
         self, field: np.ndarray, prior: LinearGaussian, schedule: np.ndarray
     ) -> Posterior:
         """From a field (N + E + L, 3), the last posterior of a schedule of standard deviations."""
-        for deviation in schedule:
-            posterior = Posterior(prior, *self.observed(field, deviation)[:2])
-            field = posterior.mean
-        return posterior
+        for deviation in schedule[:-1]:
+            field = most_probable(prior, *self.observed(field, deviation)[:2])
+        return Posterior(prior, *self.observed(field, schedule[-1])[:2])
+
+    def settled(
+        self, found: Posterior, prior: LinearGaussian, deviation: float, measured: int | None
+    ) -> tuple[Posterior, float, float]:
+        """What comes of a posterior if the standard deviation across the surface and the prior's
+        scale are those that it makes most likely itself; with the scale and the deviation.
+
+        As many independent observations are taken for granted as points were measured, however
+        many were drawn (MacKay, 1992, Bayesian interpolation, section 4). Of clouds the deviation
+        stays: it stands for planes that are wrong, which points of the same planes do not tell.
+        """
+        options, scale = self.options, 1.0
+        matches = 2 * len(self.source.points)
+        count = matches if measured is None else min(measured, matches)
+        for _ in range(options.settling):
+            free = max(count - found.determined, (1 - _FOLLOWED) * count)
+            if not self.from_cloud:
+                left = self._left_across(found.mean, deviation) * np.sqrt(matches / free)
+                deviation = float(np.clip(left, options.finest, _COARSEST))
+            scale = float(np.clip(scale * found.scale, *_SCALES))
+            schedule = np.full(_SETTLING_ROUNDS, deviation)
+            found = self.posterior(found.mean, prior.times(scale), schedule)
+        return found, scale, deviation
+
+    def _left_across(self, field: np.ndarray, deviation: float) -> float:
+        """Standard deviation of the distance across the surface that a field (N + E + L, 3) leaves,
+        by its median."""
+        moved = self.source.points + field[: len(self.source.points)]
+        index, matched, ours = self._matches(moved, self.options.turning * deviation)
+        offset, normal, _, agreeing = self._apart(moved, index, matched, ours)
+        agreeing &= ~self._beyond(moved, index, matched, deviation)
+        across = np.abs(np.einsum("nc,nc->n", normal[agreeing], offset[agreeing]))
+        return _TO_DEVIATION * float(np.median(across)) if len(across) else 0.0
 
     def tell_sides(self, field: np.ndarray) -> None:
         """Find out, where a field (N, 3) brings the source, which normals are the same side's."""
         moved = self.source.points + field[: len(self.source.points)]
-        nearest = cKDTree(self.target.points).query(moved)[1]
+        nearest = self.places.query(moved)[1]
         product = np.einsum("nc,nc->n", self.normals(moved), self.target.normals[nearest])
         clear = np.abs(product) > self.least
         same = (product[clear] > 0).mean() if clear.any() else 0.5
@@ -317,7 +390,7 @@ class _Search:
         agreeing[:count] &= options.source_looks
         agreeing[count:] &= options.target_looks
         # What lies beyond the end of a surface finds its rim, wherever it belongs.
-        beyond = self._beyond(index, matched)
+        beyond = self._beyond(moved, index, matched, deviation)
         agreeing &= ~beyond
         # As much weight for the target's points as for the source's.
         scale = np.ones(len(index))
@@ -367,15 +440,33 @@ class _Search:
         index, matched, ours = self._matches(moved, self.options.turning * deviation)
         _, _, squared, agreeing = self._apart(moved, index, matched, ours)
         met = agreeing & (squared < (self.options.reach * deviation) ** 2)
-        beyond = self._beyond(index, matched) & ~met
+        beyond = self._beyond(moved, index, matched, deviation) & ~met
         return tuple(
             Coverage(met[side], beyond[side]) for side in (slice(count), slice(count, None))
         )
 
-    def _beyond(self, index: np.ndarray, matched: np.ndarray) -> np.ndarray:
-        """Matches (n,), first those that the source looked for, that found where the other ends."""
-        count = len(self.source.points)
-        return np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
+    def _beyond(
+        self, moved: np.ndarray, index: np.ndarray, matched: np.ndarray, deviation: float
+    ) -> np.ndarray:
+        """Matches (n,), first those that the source looked for, that found where the other ends.
+
+        Of parts also those whose point found another that is much nearer to it (reciprocal
+        correspondences: Pajdla and Van Gool, 1995, Matching of 3-D curves using semi-differential
+        invariants).
+        """
+        count = len(moved)
+        beyond = np.concatenate([self.target.rim[matched[:count]], self.source.rim[index[count:]]])
+        if self.options.parts:
+            there = self.target.points[matched]
+            back = np.concatenate(
+                [
+                    cKDTree(moved).query(there[:count])[0],
+                    self.places.query(moved)[0][index[count:]],
+                ]
+            )
+            away = np.linalg.norm(there - moved[index], axis=1)
+            beyond |= away > _RECIPROCAL * back + deviation + self.spacings[1]
+        return beyond
 
     def _matches(
         self, moved: np.ndarray, turning: float
@@ -384,11 +475,11 @@ class _Search:
         for; and the normals (n, 3) of the source's, on the target's side."""
         normals = self.normals(moved)
         there = np.hstack([self.target.points, turning * self.target.normals])
-        tree, asking = cKDTree(there), there[self.asking]
+        tree, asking = _tree(there), there[self.asking]
         ways = []
         for sign in self.signs:
             here = np.hstack([moved, sign * turning * normals])
-            (away, to), (back, asked) = tree.query(here), cKDTree(here).query(asking)
+            (away, to), (back, asked) = tree.query(here), _tree(here).query(asking)
             index = np.concatenate([np.arange(len(moved)), asked])
             matched = np.concatenate([to, self.asking])
             ways.append((np.concatenate([away, back]), index, matched, sign * normals[index]))
@@ -400,6 +491,11 @@ class _Search:
             np.where(nearer if a.ndim == 1 else nearer[:, None], a, b)
             for a, b in zip(first[1:], second[1:], strict=True)
         )
+
+
+def _tree(places: np.ndarray) -> cKDTree:
+    """One that is soon made, for places (n, k) that are asked about once."""
+    return cKDTree(places, balanced_tree=False, compact_nodes=False)
 
 
 def _spacing(points: np.ndarray) -> float:
@@ -417,7 +513,8 @@ class _Rims:
     def __init__(self, source: Curve, target: Curve, options: SurfaceOptions):
         self.source, self.target, self.options = source, target, options
         self.tree = cKDTree(target.points)
-        self.off = not (options.both_look and len(target.points) and len(source.points))
+        some = len(target.points) and len(source.points)
+        self.off = options.parts or not (options.both_look and some)
 
     def observed(self, field: np.ndarray, deviation: float) -> tuple[np.ndarray, np.ndarray, float]:
         """As of :class:`_Search`, at the rim's points (E, 3)."""

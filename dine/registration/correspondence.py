@@ -26,9 +26,9 @@ from dine.geometry.rigid import (
 from dine.geometry.surface import Surface
 from dine.models.backbones import Backbone, marginal_deviation
 from dine.progress import stage
-from dine.refinement.refine import ROUNDS, Observed, Options, refine
+from dine.refinement.refine import DEFAULTS, Observed, Options, refine
 from dine.registration.shapes import FEWEST, drawn
-from dine.registration.surfaces import refined_on_surfaces
+from dine.registration.surfaces import improbabilities, refined_on_surfaces
 from dine.registration.types import Correspondence, Model, Overlap, Pair, Settings
 
 # A source point is shown by the target if a target point ends up within so many spacings of it.
@@ -36,11 +36,16 @@ _RETURN = 3.0
 # Points that end so close to each other are the same, and the share of such from which all are.
 _SAME = 1e-9
 _SHARED = 0.5
-# Share of a scan without counterpart from which scans are tried as parts that overlap.
+# Share of the surfaces without counterpart, and shares of both scans past the other's end, from
+# which scans are tried as parts that overlap. What one scan lacks by a hole, the other does not.
 _LACKING = 0.1
+_PAST_THE_END = (0.03, 0.02)
 _AS_WELL = 0.02
-# What a less likely alignment must lower the improbability to, where scans overlap.
-_MUCH_BETTER = 0.5
+# Where scans overlap: alignments that are carried to the end, no motion and those at most so much
+# less probable as judged by stiff fields; and what a later one must lower the improbability to.
+_CARRIED = 2
+_ABOUT_AS_GOOD = 1.25
+_BETTER = 0.9
 
 
 def correspondence_of(
@@ -57,13 +62,13 @@ def correspondence_of(
     pairs = aligned_pairs(source, target, settings, model.convention)
     found = _most_probable(pairs, model, settings)
     may_lie_otherwise = isinstance(settings.prealign, str) and settings.prealign == "auto"
-    if settings.overlap is Overlap.AUTO and may_lie_otherwise and _lacks(found[1]):
-        settings = replace(settings, overlap=Overlap.BOTH)
-        pairs = aligned_pairs(source, target, settings, model.convention)
-        parts = _most_probable(pairs, model, settings)
+    if settings.overlap is Overlap.AUTO and may_lie_otherwise and lacks(found[1]):
+        as_parts = replace(settings, overlap=Overlap.BOTH)
+        pairs = aligned_pairs(source, target, as_parts, model.convention)
+        parts = _most_probable(pairs, model, as_parts)
         if parts[1].unmet < found[1].unmet + _AS_WELL:
-            return parts
-    return found
+            return parts[0], replace(parts[1], overlap=Overlap.BOTH)
+    return found[0], replace(found[1], overlap=settings.overlap)
 
 
 def _check(settings: Settings) -> None:
@@ -82,11 +87,12 @@ def _check(settings: Settings) -> None:
         )
 
 
-def _lacks(found: Correspondence) -> bool:
-    """Whether much of the surfaces has no counterpart: more than one scan lacks by a hole."""
+def lacks(found: Correspondence) -> bool:
+    """Whether more has no counterpart than one scan lacks by a hole."""
     if found.unmet is None:
         return False
-    parts = min(found.shown) < 1 - _LACKING and max(found.shown) < 1 - _LACKING / 5
+    more, less = _PAST_THE_END
+    parts = min(found.shown) < 1 - more and max(found.shown) < 1 - less
     return parts or found.unmet > _LACKING
 
 
@@ -147,16 +153,29 @@ def _most_probable(
 
     The first where surfaces are not looked at, or little of one scan is to be seen.
     """
+    if settings.overlap is Overlap.BOTH:
+        return _of_parts(pairs, model, settings)
     found = [(pairs[0], correspond(pairs[0], model, settings))]
-    symmetric = settings.overlap in (Overlap.AUTO, Overlap.BOTH)
-    if found[0][1].improbability is not None and symmetric:
+    if found[0][1].improbability is not None and settings.overlap is Overlap.AUTO:
         found += [(pair, correspond(pair, model, settings)) for pair in pairs[1:]]
-    if settings.overlap is not Overlap.BOTH:
-        return min(found, key=lambda one: one[1].improbability or 0.0)
-    # Once bent, parts can fit by chance. How they lie says more: the likeliest come first.
-    best = found[0]
-    for one in found[1:]:
-        if one[1].improbability < _MUCH_BETTER * best[1].improbability:
+    return min(found, key=lambda one: one[1].improbability or 0.0)
+
+
+def _of_parts(
+    pairs: Sequence[Pair], model: Model, settings: Settings
+) -> tuple[Pair, Correspondence]:
+    """The same where each scan shows what the other does not.
+
+    Once bent, parts can fit by chance. How they fit while they hardly bend says more, and then the
+    first is kept, unless another explains the surfaces better in the end.
+    """
+    values = improbabilities(pairs, settings) if len(pairs) > 1 else [0.0]
+    order = sorted(range(1, len(pairs)), key=values.__getitem__)
+    likely = [i for i in order if values[i] <= _ABOUT_AS_GOOD * values[0]]
+    best = None
+    for i in [0, *likely[: _CARRIED - 1]]:
+        one = pairs[i], correspond(pairs[i], model, settings)
+        if best is None or one[1].improbability < _BETTER * best[1].improbability:
             best = one
     return best
 
@@ -187,13 +206,15 @@ def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence
         stage("points")
         options = Options(settings.rounds, part=True)
         return replace(_still(pair), field=refine(pair.start, pair.goal, options=options).mean)
-    there = one_way(model.backbone, pair.start, pair.goal, settings)
+    # Points drawn on a mesh lie between its vertices.
+    shared = pair.source.faces is None and pair.target.faces is None
+    there = one_way(model.backbone, pair.start, pair.goal, settings, shared)
     if settings.surfaces and settings.rounds:
         return there  # surfaces will say more
     # The way back has a frame of its own, in which the target is the source.
     frame = Frame.of(pair.goal)
     seen, whole = frame.normalise(pair.goal), frame.normalise(pair.start)
-    back = one_way(model.backbone, seen, whole, settings).field * frame.scale
+    back = one_way(model.backbone, seen, whole, settings, shared).field * frame.scale
     return replace(there, inconsistency=_inconsistency(there, back))
 
 
@@ -204,11 +225,16 @@ def _still(pair: Pair) -> Correspondence:
 
 
 def one_way(
-    backbone: Backbone, start: np.ndarray, goal: np.ndarray, settings: Settings
+    backbone: Backbone,
+    start: np.ndarray,
+    goal: np.ndarray,
+    settings: Settings,
+    shared: bool = True,
 ) -> Correspondence:
     """Where the points ``start`` (N, 3) belong among those of ``goal`` (M, 3), normalised frame,
-    without the check of the way back."""
-    field, indicator = predict_and_refine(backbone, start, goal, settings.device, settings.rounds)
+    without the check of the way back. ``shared``: both may hold the same points."""
+    options = Options(settings.rounds, shared=shared)
+    field, indicator = predict_and_refine(backbone, start, goal, settings.device, options)
     return Correspondence(start, goal, field, indicator, np.ones(len(start), bool))
 
 
@@ -218,7 +244,7 @@ def predict_and_refine(
     source: np.ndarray,
     target: np.ndarray,
     device: torch.device,
-    rounds: int = ROUNDS,
+    options: Options = DEFAULTS,
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Displacement (N, 3) and what tells its errors apart (N,), float64, normalised frame.
 
@@ -234,11 +260,11 @@ def predict_and_refine(
     predicted = result.displacement[0].double().cpu().numpy()
     deviation = marginal_deviation(backbone, result)
     deviation = None if deviation is None else deviation[0].double().cpu().numpy()
-    if rounds == 0:
+    if options.rounds == 0:
         return predicted, deviation
     stage("points")
     observed = Observed.of_network(predicted, deviation)
-    refined = refine(source, target, observed, options=Options(rounds)).mean
+    refined = refine(source, target, observed, options=options).mean
     elsewhere = np.linalg.norm(refined - predicted, axis=1)
     return refined, np.linalg.norm(refined, axis=1) + elsewhere
 

@@ -19,6 +19,8 @@ from dine.progress import stage
 from dine.refinement.refine import ROUNDS
 from dine.registration.assessment import Measures, assess, expected_error, measure
 from dine.registration.correspondence import correspondence_of
+from dine.registration.mirrored import SENTENCE as MIRRORED
+from dine.registration.mirrored import looks_mirrored
 from dine.registration.model import load_model
 from dine.registration.shapes import (
     POINTS,
@@ -191,11 +193,14 @@ def _registered(
     notes = check_sizes(source, target, settings.overlap is not Overlap.AUTO)
     pair, correspondence = correspondence_of(source, target, model, settings)
     stage("measures")
+    notes += _parts(settings, correspondence)
+    if looks_mirrored(pair, correspondence, settings):
+        notes.append(MIRRORED)
 
     motion = Motion(pair.alignment, correspondence.interpolated())
     moved = motion.surface(source)
     displacement = moved.vertices - source.vertices
-    calibration = model.calibration_for(settings)
+    calibration = model.calibration_for(settings, correspondence.overlap)
     expected = expected_error(calibration, correspondence, pair)
     measures = measure(pair, correspondence, motion, model, settings, expected)
     trust = assess(
@@ -208,6 +213,7 @@ def _registered(
     )
     report = _report(pair, correspondence, displacement, measures, trust, model)
     report["settings"] = settings.described(len(pair.start))
+    report["overlap_found"] = str(correspondence.overlap)
     if marks is not None:
         report["landmarks"] = _landmarks(*marks, motion)
     applied = {name: motion.surface(surface) for name, surface in further.items()}
@@ -229,6 +235,16 @@ def _registered(
         motion=motion,
         applied_from={name: surface.vertices for name, surface in further.items()},
     )
+
+
+def _parts(settings: Settings, correspondence: Correspondence) -> list[str]:
+    """What to say where parts turned out to be missing."""
+    if settings.overlap is correspondence.overlap or settings.overlap is not Overlap.AUTO:
+        return []
+    return [
+        "Both scans seem to show what the other does not, so they were registered as parts that "
+        "overlap; how far such results are off is not calibrated."
+    ]
 
 
 def _support(correspondence: Correspondence) -> tuple[str, ...]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve
 from scipy.spatial import cKDTree
 
 from dine.data.sampling import sample_surface
@@ -14,15 +17,16 @@ from dine.geometry.oriented import (
     OrientedPoints,
     evenly,
     fitted_planes,
+    fitted_quadrics,
     rim_curve,
     rim_edges,
     rim_points,
     unit,
 )
 from dine.geometry.surface import Surface
-from dine.priors.gaussian import CovarianceRoot, LinearGaussian, Posterior
+from dine.priors.gaussian import CovarianceRoot, LinearGaussian
 from dine.progress import stage
-from dine.refinement.process import STIFFER, SURFACE
+from dine.refinement.process import STIFF_AND_BENT, STIFFER, SURFACE
 from dine.refinement.surface import (
     NO_GUIDES,
     OnSurface,
@@ -39,14 +43,33 @@ TARGET_POINTS = 20_000
 _DRAWN = 4
 # Error of a coarse field, which a start that the process allows is fitted to.
 _COARSE_ERROR = 0.01
-# Where scans overlap: what points beyond the other's end cost, against others without counterpart,
-# and how the first, stiff field is found.
+# Where scans overlap: what points beyond the other's end cost, against others without counterpart;
+# how stiff fields are found, each from the one before; and how the search goes on from these.
 _MISSING = 0.2
-_ROUGHLY = {"last": 0.05, "between": 0.05, "firsts": (0.2, 0.1), "rounds": 15}
+_ROUGHLY = ((STIFFER, 0.2, 15), (STIFF_AND_BENT, 0.15, 10))
+_ROUGH_END = 0.05
+_GOING_ON = (0.08, 0.04)
 # Points through which a plane is laid to see how rough a mesh is, and the cosine between planes and
 # faces below which its faces are not followed: 20 degrees.
 _SMOOTHED = 24
 _NOISY = 0.94
+_LOOKED_AT = 2000
+# How often, of whole scans, their noise and the scale of the prior are estimated at the end.
+_SETTLING = 3
+
+
+class Glance(NamedTuple):
+    """How closely rigid alignments are looked at: points of the source and of the target, and the
+    standard deviation that ends it."""
+
+    source: int
+    target: int
+    end: float
+
+
+QUICK = Glance(400, 2000, _ROUGH_END)
+CLOSE = Glance(800, 5000, 0.02)
+_GLANCES = 12
 
 
 @dataclass(frozen=True)
@@ -61,40 +84,36 @@ class ProcessField:
 
     def __call__(self, places: np.ndarray) -> np.ndarray:
         """The displacement (M, 3) at places (M, 3), normalised frame."""
-        found = np.empty((len(places), 3))
-        # A kernel of r columns for so many rows at once.
-        for first in range(0, len(places), _ROWS):
-            rows = slice(first, first + _ROWS)
-            found[rows] = self.root.at(within_reach(places[rows])) @ self.amplitudes
-        return found
-
-
-_ROWS = 20_000
+        return self.root.field(within_reach(places), self.amplitudes)
 
 
 def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> OrientedPoints:
     """At most ``count`` points of a surface and its normals there.
 
     Drawn by area from a mesh; of a cloud those that cover it evenly. The faces of a noisy mesh lie
-    every way; planes through neighbours replace them there.
+    every way; planes through neighbours replace them there; of a cloud they are those of quadrics.
     """
     if surface.faces is None:
         points = surface.vertices[near_points(surface.vertices)]
         points = points[evenly(points, count)]
-        normals, _ = fitted_planes(points)
+        normals = fitted_quadrics(points)
         return OrientedPoints(points, normals, rim_points(points, normals))
     samples = sample_surface(surface, count, rng)
     corners = surface.vertices[samples.faces_vertices]
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     points = samples.places(surface.vertices)
-    planes, _ = fitted_planes(points, _SMOOTHED)
-    product = np.einsum("nc,nc->n", planes, normals)
+    # They were drawn one independently of the other, so the first say how all are.
+    some = slice(_LOOKED_AT)
+    product = np.einsum("nc,nc->n", fitted_planes(points, _SMOOTHED, some)[0], normals[some])
     if np.median(np.abs(product)) < _NOISY:
-        normals = planes * np.where(product < 0, -1.0, 1.0)[:, None]
+        planes, _ = fitted_planes(points, _SMOOTHED)
+        same_side = np.einsum("nc,nc->n", planes, normals) >= 0
+        normals = planes * np.where(same_side, 1.0, -1.0)[:, None]
     ends = np.zeros(len(surface.vertices), bool)
     ends[rim_edges(surface.faces, len(ends))] = True
     rim = ends[samples.faces_vertices].any(axis=1)
-    return OrientedPoints(points, normals, rim)
+    # In the order of a tree neighbours follow each other, which makes searches quicker.
+    return OrientedPoints(points, normals, rim).at(cKDTree(points).indices)
 
 
 def rim_of(surface: Surface, spacing: float) -> Curve:
@@ -108,7 +127,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     stage("surfaces")
     rng = np.random.default_rng([7, settings.seed])
     source, target = (
-        replace(surface, vertices=normalise(surface.vertices))
+        surface.similar(normalise(surface.vertices))
         for surface, normalise in (
             (pair.source, pair.alignment.normalise),
             (pair.target, pair.alignment.frame.normalise),
@@ -118,27 +137,29 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     drawn = drawn.at(evenly(drawn.points, SOURCE_POINTS))
     tree = cKDTree(drawn.points)
     spacing = float(np.median(tree.query(drawn.points, k=2)[0][:, 1]))
-    moving = Outline(drawn, rim_of(source, spacing))
-    fixed = Outline(oriented_points(target, TARGET_POINTS, rng), rim_of(target, spacing / 4))
+    moving = Outline(drawn, rim_of(source, spacing), *_measured(source))
+    seen = oriented_points(target, TARGET_POINTS, rng)
+    fixed = Outline(seen, rim_of(target, spacing / 4), *_measured(target))
     guides = settings.guide.within(pair.alignment) if settings.guide else NO_GUIDES
     places = np.vstack([moving.places, guides.places])
     root = SURFACE.fitted(places)
     prior = LinearGaussian.of_kernel(root.root)
     starts = [np.zeros_like(places)]
     if found.field.any():
-        start = ProcessField(root, _fitted(root, found.start, found.field))
-        starts.insert(0, start(places))
+        starts.insert(0, root.root @ _fitted(root.at(found.start), found.field))
     options = _options(settings.overlap)
     if settings.overlap is Overlap.BOTH:
-        # Of parts, a loose field would make wholes of each other: first, one that hardly bends.
-        stiff = LinearGaussian.of_kernel(STIFFER.fitted(places).root)
-        rough = refine_on_surface(
-            moving, fixed, starts, stiff, replace(options, **_ROUGHLY), guides
-        )
-        start = ProcessField(root, _fitted(root, places, rough.posterior.mean))
-        starts.insert(0, start(places))
+        # Of parts, a loose field would make wholes of each other: first, some that hardly bend.
+        field, starts = starts[0], []
+        for process, first, rounds in _ROUGHLY:
+            stiff = LinearGaussian.of_kernel(process.fitted(places).root)
+            roughly = _rough(options, first, rounds)
+            rough = refine_on_surface(moving, fixed, [field], stiff, roughly, guides)
+            field = rough.posterior.mean
+            starts.append(root.root @ _fitted(root.root, field))
+        options = replace(options, firsts=_GOING_ON)
     end = refine_on_surface(moving, fixed, starts, prior, options, guides)
-    posterior = end.posterior
+    posterior, root = end.posterior, root.times(end.scale)
     anywhere = ProcessField(root, posterior.alone)
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
@@ -156,8 +177,54 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     )
 
 
+def _measured(surface: Surface) -> tuple[int, float]:
+    """How many points a surface was measured at, and the median distance between those of a cloud;
+    0 of a mesh."""
+    points = surface.vertices
+    if surface.faces is not None:
+        return len(points), 0.0
+    points = points[near_points(points)]
+    some = points[:: max(len(points) // _LOOKED_AT, 1)]
+    return len(points), float(np.median(cKDTree(points).query(some, k=2)[0][:, 1]))
+
+
+def _rough(
+    options: SurfaceOptions, first: float, rounds: int, end: float = _ROUGH_END
+) -> SurfaceOptions:
+    return replace(options, firsts=(first,), between=end, last=end, rounds=rounds)
+
+
+def improbabilities(
+    pairs: Sequence[Pair], settings: Settings, glance: Glance = QUICK
+) -> list[float]:
+    """How little each of several alignments of two scans explains: −log of the evidence, up to a
+    constant, of the surfaces and a field that hardly bends, on few points."""
+    rng = np.random.default_rng([8, settings.seed])
+    source, target = (
+        drawn.at(evenly(drawn.points, count))
+        for drawn, count in (
+            (oriented_points(pairs[0].source, _DRAWN * glance.source, rng), glance.source),
+            (oriented_points(pairs[0].target, _DRAWN * glance.target, rng), glance.target),
+        )
+    )
+    none = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
+    options = _rough(_options(settings.overlap), _ROUGHLY[0][1], _GLANCES, glance.end)
+    found = []
+    for pair in pairs:
+        normals = source.normals @ pair.alignment.matrix[:3, :3].T
+        here = source._replace(points=pair.alignment.normalise(source.points), normals=normals)
+        there = target._replace(points=pair.alignment.frame.normalise(target.points))
+        prior = STIFFER.at(here.points)
+        start = np.zeros_like(here.points)
+        end = refine_on_surface(Outline(here, none), Outline(there, none), [start], prior, options)
+        found.append(end.improbability)
+    return found
+
+
 def _options(overlap: Overlap) -> SurfaceOptions:
     return SurfaceOptions(
+        settling=_SETTLING if overlap is Overlap.AUTO else 0,
+        parts=overlap is Overlap.BOTH,
         missing=_MISSING if overlap is Overlap.BOTH else 1.0,
         source_looks=overlap is not Overlap.TARGET_IN_SOURCE,
         target_looks=overlap is not Overlap.SOURCE_IN_TARGET,
@@ -177,8 +244,11 @@ def _covered(end: OnSurface, overlap: Overlap) -> tuple[float, tuple[float, floa
     return min(source.unmet, target.unmet), shown, source.beyond
 
 
-def _fitted(root: CovarianceRoot, places: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Amplitudes (r, 3) of the most probable field that is nearly ``field`` (N, 3) at places."""
+def _fitted(kernel: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Amplitudes (r, 3) of the most probable field that is nearly ``field`` (N, 3), of a process
+    whose root at its places is this kernel (N, r)."""
     precision = 1 / _COARSE_ERROR**2
-    every = np.broadcast_to(precision * np.eye(3), (len(places), 3, 3))
-    return Posterior(LinearGaussian.of_kernel(root.at(places)), precision * field, every).alone
+    # The three coordinates do not know of each other, and share a system.
+    system = precision * kernel.T @ kernel
+    system[np.diag_indices_from(system)] += 1
+    return solve(system, precision * kernel.T @ field, assume_a="pos")

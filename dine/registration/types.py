@@ -28,30 +28,6 @@ if TYPE_CHECKING:
 _CLEARLY = 0.1
 
 
-@dataclass(frozen=True)
-class Model:
-    """Weights with what belongs to them; see :func:`~dine.registration.model.load_model`."""
-
-    backbone: Any
-    weights: Path
-    facts: dict[str, Any]
-    prior: Any = None
-    prior_path: Path | None = None
-    calibration: Calibration | None = None
-
-    @property
-    def convention(self) -> str:
-        """The order of points that the prior was fitted in; ``none`` where it does not say."""
-        return str(self.prior.notes.get("convention", "none")) if self.prior else "none"
-
-    def calibration_for(self, settings: Settings) -> Calibration | None:
-        """The calibration where it applies: to whole targets, refined as it was made with."""
-        if self.calibration is None or settings.overlap is not Overlap.AUTO:
-            return None
-        made = (self.calibration.facts.get("rounds"), self.calibration.facts.get("surfaces", False))
-        return self.calibration if made == (settings.rounds, settings.surfaces) else None
-
-
 class Overlap(StrEnum):
     """Which part of the object each scan shows."""
 
@@ -75,6 +51,36 @@ class Overlap(StrEnum):
             raise ConfigError(
                 f"The overlap is {name!r}; expected one of {', '.join(cls)}."
             ) from None
+
+
+@dataclass(frozen=True)
+class Model:
+    """Weights with what belongs to them; see :func:`~dine.registration.model.load_model`."""
+
+    backbone: Any
+    weights: Path
+    facts: dict[str, Any]
+    prior: Any = None
+    prior_path: Path | None = None
+    calibration: Calibration | None = None
+
+    @property
+    def convention(self) -> str:
+        """The order of points that the prior was fitted in; ``none`` where it does not say."""
+        return str(self.prior.notes.get("convention", "none")) if self.prior else "none"
+
+    def calibration_for(
+        self, settings: Settings, found: Overlap = Overlap.AUTO
+    ) -> Calibration | None:
+        """The calibration where it applies: to whole scans, refined as it was made with.
+
+        ``found`` is the overlap that ``auto`` came to.
+        """
+        whole = settings.overlap is Overlap.AUTO and found is Overlap.AUTO
+        if self.calibration is None or not whole:
+            return None
+        made = (self.calibration.facts.get("rounds"), self.calibration.facts.get("surfaces", False))
+        return self.calibration if made == (settings.rounds, settings.surfaces) else None
 
 
 @dataclass(frozen=True)
@@ -186,6 +192,8 @@ class Correspondence:
             although this goes on there; None where only points were looked at.
         shown: shares of the source and of the target that the other shows; 0 where it is not known
             to.
+        overlap: as which the scans were registered, ``both`` where ``auto`` found that parts are
+            missing.
     """
 
     start: np.ndarray
@@ -198,6 +206,7 @@ class Correspondence:
     improbability: float | None = None
     unmet: float | None = None
     shown: tuple[float, float] = (1.0, 1.0)
+    overlap: Overlap = Overlap.AUTO
 
     def interpolated(self) -> Callable[[np.ndarray], np.ndarray]:
         """The field as a function of (M, 3) places, normalised frame."""

@@ -1,5 +1,7 @@
 """Refinement against surfaces: on what is known to be the answer, and within registrations."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -16,7 +18,10 @@ from dine.io.readers import read_surface
 from dine.io.writers import write_surface
 from dine.refinement.process import SURFACE
 from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
+from dine.registration.correspondence import lacks
+from dine.registration.mirrored import mirrored
 from dine.registration.surfaces import oriented_points
+from dine.registration.types import Correspondence
 
 pytestmark = pytest.mark.numerical
 NO_CURVE = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -122,6 +127,27 @@ def test_parts_that_overlap_come_to_lie_on_each_other(overlapping, overlap):
     assert 0.6 < result.report["supported"] < 0.9
     assert "no counterpart" in " ".join(result.trust.reasons)
     assert result.report["settings"]["overlap"] == overlap
+    # The calibration is of whole scans; of parts it would promise too much.
+    assert result.report["overlap_found"] == "both"
+    assert result.uncertainty is None
+    assert result.trust.verdict == "doubtful"
+    assert ("registered as parts" in " ".join(result.trust.reasons)) == (overlap == "auto")
+
+
+@pytest.mark.parametrize(
+    ("shown", "unmet", "parts"),
+    [
+        ((1.0, 0.8), 0.02, False),  # a hole
+        ((0.986, 1.0), 0.01, False),  # the rim of a face
+        ((0.96, 0.97), 0.02, True),
+        ((1.0, 1.0), 0.12, True),
+    ],
+)
+def test_parts_are_tried_where_both_scans_lack_something(shown, unmet, parts):
+    points = np.zeros((1, 3))
+    found = Correspondence(points, points, points, None, np.ones(1, bool))
+    found = dataclasses.replace(found, shown=shown, unmet=unmet)
+    assert lacks(found) == parts
 
 
 def test_a_source_that_is_a_part_of_its_target(pair):
@@ -243,3 +269,73 @@ def test_an_open_sheet_does_not_shrink_to_be_rid_of_its_rim():
     target = Surface(np.concatenate([truth, middles]), split)
     result = dine.register(sheet, target, prealign="off")
     assert mean_error(result.moved.vertices, truth) < 0.015
+
+
+def test_whole_scans_are_judged_by_the_calibration(pair):
+    result = dine.register(pair[0], pair[1], prealign="off")
+    assert result.report["overlap_found"] == "auto"
+    assert result.uncertainty is not None
+
+
+def stripes(*kept):
+    """A flat sheet 2 wide that is cut at some places in x; where it was cut, it has a rim."""
+    low, high = kept
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(low, high, 41), np.linspace(-1, 1, 41)))
+    points = np.column_stack([x, y, np.zeros(len(x))])
+    up = np.tile([0.0, 0, 1], (len(points), 1))
+    rim = (np.abs(x - low) < 1e-9) | (np.abs(x - high) < 1e-9)
+    ends = np.column_stack([np.repeat([low, high], 41), np.tile(y[::41], 2), np.zeros(82)])
+    along = Curve(ends, np.tile([0.0, 1, 0], (82, 1)))
+    return Outline(OrientedPoints(points, up, rim), along)
+
+
+def test_rims_of_parts_do_not_pull_at_each_other():
+    """Two parts of one sheet lie where they belong; one is cut a third of the way further on."""
+    source, target = stripes(-1.0, 1.0), stripes(-0.4, 1.6)
+    prior = SURFACE.at(source.places)
+    start = [np.zeros_like(source.places)]
+    moved = {}
+    for parts in (True, False):
+        options = SurfaceOptions(parts=parts, missing=0.2 if parts else 1.0)
+        found = refine_on_surface(source, target, start, prior, options)
+        moved[parts] = np.abs(found.posterior.mean).max()
+    assert moved[True] < 0.02
+    assert moved[False] > 0.2
+
+
+def test_what_only_one_part_shows_finds_nothing_beside_the_other():
+    """A second sheet above one that both show has no counterpart, nor an end of the other near."""
+    source, target = sheet_at(0.0, 0.25), sheet_at(0.0)
+    prior = SURFACE.at(source.places)
+    start = [np.zeros_like(source.places)]
+    moved = {}
+    for parts in (True, False):
+        options = SurfaceOptions(firsts=(0.1,), between=0.1, last=0.1, parts=parts)
+        found = refine_on_surface(source, target, start, prior, options)
+        moved[parts] = found.posterior.mean[-31 * 31 :, 2].mean()
+    assert abs(moved[True]) < 0.02
+    assert moved[False] < -0.1
+
+
+@pytest.mark.parametrize("flipped", [True, False])
+def test_a_mirror_image_is_told(pair, flipped):
+    source, target, _ = pair
+    if flipped:
+        target = mirrored(target)
+    result = dine.register(source, target)
+    assert any("mirror image" in reason for reason in result.trust.reasons) == flipped
+    if flipped:
+        assert result.trust.verdict != "plausible"
+
+
+def test_a_symmetric_object_is_no_mirror_image_of_itself():
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    source = Surface(np.asarray(ball.vertices) * [1.0, 0.7, 0.5], np.asarray(ball.faces))
+    target = mirrored(Surface(bent(source.vertices), source.faces))
+    result = dine.register(source, target)
+    assert not any("mirror image" in reason for reason in result.trust.reasons)
+
+
+def test_mirroring_turns_faces_over():
+    found = oriented_points(mirrored(organ()), 500, np.random.default_rng(0))
+    assert ((found.normals * found.points).sum(axis=1) > 0).mean() > 0.98

@@ -155,9 +155,13 @@ def standardised(points):
     return (points - points.mean(0)) / np.sqrt(((points - points.mean(0)) ** 2).mean())
 
 
-# After 40 rounds the mixture is narrow and only close points are compared.
+# After 40 rounds the mixture is narrow and only close points are compared. Of very many pairs, here
+# of all, densities are in single precision until then.
+@pytest.mark.parametrize("many", [False, True])
 @pytest.mark.parametrize("rounds", [1, 12, 40])
-def test_bcpd_does_what_the_paper_says(rounds):
+def test_bcpd_does_what_the_paper_says(rounds, many, monkeypatch):
+    if many:
+        monkeypatch.setattr("dine.classical.bcpd._MANY", 0)
     source = standardised(sphere(120) * [1.0, 0.75, 0.55])
     target = bent(source) @ Rotation.from_euler("z", 5, degrees=True).as_matrix().T
     target = standardised(np.random.default_rng(0).permutation(target)[:110])

@@ -1,6 +1,7 @@
 """Kernels and their roots against naive formulae."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from dine.priors.gaussian import (
     LinearGaussian,
     Posterior,
     covariance_root,
+    most_probable,
     squared_exponential,
 )
 
@@ -77,6 +79,14 @@ def test_a_root_goes_on_as_the_process_does():
     assert np.allclose(fitted.at(others) @ fitted.root.T, expected, atol=1e-7)
 
 
+def test_a_field_goes_on_as_its_root_does():
+    fitted = covariance_root(cloud(40), WIDTHS, AMPLITUDES, AFFINE, rank=20)
+    amplitudes, places = cloud(20, seed=2), cloud(700, seed=3)
+    expected = fitted.at(places) @ amplitudes
+    assert np.allclose(fitted.field(places, amplitudes), expected, atol=1e-9)
+    assert fitted.field(places[:0], amplitudes).shape == (0, 3)
+
+
 def observed(points=12, kernel=4, modes=3, seed=0):
     """A prior, and sums of precisions and of weighted values at its points."""
     rng = np.random.default_rng(seed)
@@ -116,6 +126,33 @@ def test_a_posterior_is_that_of_linear_regression(kernel, modes):
     assert found.energy == pytest.approx(0.5 * (amplitudes**2).sum())
     variances = np.diag(design @ covariance @ design.T).reshape(-1, 3).sum(axis=1)
     assert np.allclose(found.variance(prior.kernel, prior.modes), variances)
+
+
+@pytest.mark.parametrize("modes", [0, 3])
+@pytest.mark.parametrize("exact", [1.0, 1e5])
+def test_the_most_probable_field_alone_is_the_posterior_mean(modes, exact):
+    # Products of two coordinates weigh less than nothing at some points.
+    prior, pulled, precision = observed(points=300, kernel=40, modes=modes)
+    prior = replace(prior, mean=np.zeros_like(prior.mean)) if modes == 0 else prior
+    assert (precision[:, 0, 1] < 0).any()
+    assert (precision[:, 0, 1] > 0).any()
+    found = most_probable(prior, exact * pulled, exact * precision)
+    expected = Posterior(prior, exact * pulled, exact * precision).mean
+    assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("apart", [1e-2, 1e-3, 1e-5])
+@pytest.mark.parametrize("exact", [1e4, 1e8])
+def test_what_single_precision_cannot_solve_is_solved_in_double(exact, apart):
+    rng = np.random.default_rng(0)
+    # Columns that are nearly the same.
+    kernel = rng.normal(size=(50, 1)) + apart * rng.normal(size=(50, 40))
+    prior = LinearGaussian.of_kernel(kernel)
+    precision = np.broadcast_to(exact * np.eye(3), (50, 3, 3))
+    pulled = exact * cloud(50)
+    expected = Posterior(prior, pulled, precision).mean
+    found = most_probable(prior, pulled, precision)
+    assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
 
 
 def test_without_observations_a_posterior_is_the_prior():

@@ -106,5 +106,8 @@ def test_planes_say_how_rough_a_cloud_is(sphere):
     rng = np.random.default_rng(0)
     flat = np.concatenate([rng.uniform(-1, 1, (4000, 2)), np.zeros((4000, 1))], axis=1)
     assert fitted_planes(flat)[1].max() < 1e-9
+    some = np.array([7, 4, 3999])
+    for whole, part in zip(fitted_planes(flat), fitted_planes(flat, at=some), strict=True):
+        assert np.array_equal(whole[some], part)
     noisy = flat + 0.02 * rng.normal(size=flat.shape) * [0, 0, 1]
     assert np.median(fitted_planes(noisy)[1]) == pytest.approx(0.015, rel=0.2)

@@ -264,6 +264,15 @@ def test_a_part_looks_for_the_whole(pair):
     assert error(found, truth[shown]) < 0.5 * np.linalg.norm(truth[shown], axis=1).mean()
 
 
+def test_points_that_cannot_be_shared_are_not_looked_for(pair, monkeypatch):
+    source = pair[0]
+    others = organ(len(source), 11) + 0.1
+    expected = refine(source, others).mean
+    monkeypatch.setattr("dine.refinement.refine.SharedPoints", None)
+    found = refine(source, others, options=Options(shared=False)).mean
+    np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize(("points", "targets"), [(3, 1), (1, 3), (1, 1), (8, 8), (9, 9)])
 def test_few_points(points, targets):
     source = organ(points, 5)

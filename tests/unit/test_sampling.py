@@ -11,6 +11,7 @@ from dine.data.sampling import (
     sample_surface,
     sunflower_disc,
 )
+from dine.data.synthetic import tissue_patch
 from dine.errors import ConfigError, DataError
 from dine.geometry.surface import Surface
 
@@ -216,3 +217,21 @@ def test_wrong_arguments_are_refused():
     for shape in ((1, 50, 3), (3, 10, 3), (50, 3)):
         with pytest.raises(DataError, match="at least 2 objects"):
             neighbourhood_agreement(np.zeros(shape), k=10, rng=rng())
+
+
+def test_areas_are_found_once_and_stay_with_what_is_moved_as_a_whole():
+    surface = tissue_patch(0, 0)
+    corners = surface.vertices[surface.faces]
+    area = np.linalg.norm(np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)), axis=1)
+    np.testing.assert_allclose(
+        surface.area_reach / surface.area_reach[-1], np.cumsum(area) / area.sum(), atol=1e-12
+    )
+    moved = surface.similar(1000 * surface.vertices[:, [1, 2, 0]] + 5)
+    assert moved.area_reach is surface.area_reach
+    drawn, expected = (sample_surface(x, 50, np.random.default_rng(1)) for x in (moved, surface))
+    np.testing.assert_array_equal(drawn.weights, expected.weights)
+    np.testing.assert_allclose(
+        drawn.places(moved.vertices), 1000 * expected.places(surface.vertices)[:, [1, 2, 0]] + 5
+    )
+    cloud = Surface(surface.vertices).similar(2 * surface.vertices)
+    assert cloud.faces is None
