@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from dine.geometry.distance import distances
 from dine.geometry.surface import Surface
 from dine.registration.correspondence import aligned_pairs
 from dine.registration.surfaces import CLOSE, improbabilities
@@ -15,6 +16,8 @@ from dine.registration.types import Correspondence, Overlap, Pair, Settings
 _NEAR = 0.03
 # What the mirrored source lowers the improbability to, if the target is its mirror image.
 _MUCH_BETTER = 0.7
+# What it lowers the mean distance of rigidly aligned points to, if it is looked at more closely.
+_BETTER = 0.9
 
 SENTENCE = (
     "The target looks like a mirror image of the source, such as a left organ for a right one: "
@@ -41,5 +44,12 @@ def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> boo
     otherwise = aligned_pairs(
         mirrored(pair.source), pair.target, replace(settings, prealign="auto"), "none"
     )
+    if min(map(_apart, otherwise)) > _BETTER * _apart(pair):
+        return False
     as_given = improbabilities([pair], settings, CLOSE)[0]
     return min(improbabilities(otherwise, settings, CLOSE)) < _MUCH_BETTER * as_given
+
+
+def _apart(pair: Pair) -> float:
+    """Mean distance between the points of both scans as they are aligned, both ways."""
+    return float(distances(pair.start, pair.goal).mean() + distances(pair.goal, pair.start).mean())
