@@ -106,8 +106,9 @@ _SETTLING_ROUNDS = 3
 _COARSEST = 0.05
 _SCALES = (0.1, 1.0)
 _FOLLOWED = 0.8
-# Median distances to the next point of a cloud that count as how far off its planes are half way.
-_BETWEEN = 0.8
+# How far off planes are between the points of a cloud, for each square of their median distance: as
+# on spheres of radius 0.08 half way between points twice as far apart.
+_OFF_BETWEEN = 24.0
 
 
 class Outline(NamedTuple):
@@ -218,7 +219,7 @@ def refine_on_surface(
     # Neither noise nor what planes through neighbours miss of a curved surface is to be followed.
     some = spread(len(target.surface.points), _ROUGHNESS_POINTS)
     rough = float(np.median(fitted_planes(target.surface.points, at=some)[1]))
-    last = max(options.last, rough, _BETWEEN * max(source.gaps, target.gaps))
+    last = max(options.last, rough, _OFF_BETWEEN * max(source.gaps, target.gaps) ** 2)
     between = max(options.between, last)
     search = _Search(source, target, options, _LOOKING, guides)
     search.tell_sides(starts[0])
