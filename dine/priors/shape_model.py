@@ -183,12 +183,13 @@ def shape_model_of(
         shapes = np.stack([_scaled(shape, size, mask) for shape in shapes])
     shapes = generalised_procrustes(shapes, template.vertices, mask)
     shapes = np.stack([_without_unused(shape, template) for shape in shapes])
-    mean, all_modes = components(shapes, len(shapes))
-    if rms(all_modes, mask).max() < _EQUAL * Frame.of(template.vertices[mask]).scale:
+    radius = Frame.of(template.vertices[mask]).scale
+    if rms(shapes - shapes.mean(axis=0), mask).max() < _EQUAL * radius:
         raise DataError(
             f"All {len(shapes)} shapes are equal but for their pose{' and size' * scale}; a shape "
             "model needs scans that differ."
         )
+    mean, all_modes = components(shapes, len(shapes))
     kept = _kept(rms(all_modes, mask) ** 2, len(shapes), modes)
     fields = OrganDeformations(template, shapes - template.vertices)
     prior = learn(template, [fields], _learning(len(shapes)), seed=seed)
