@@ -12,7 +12,7 @@ from dine.cli import cli
 from dine.data.sampling import sample_surface
 from dine.errors import DineError
 from dine.files import read_json
-from dine.geometry.oriented import Curve, OrientedPoints
+from dine.geometry.oriented import Curve, OrientedPoints, evenly
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_surface
@@ -27,9 +27,9 @@ pytestmark = pytest.mark.numerical
 NO_CURVE = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
-def organ(degrees=0.0):
+def organ(degrees=0.0, subdivisions=4):
     """A lopsided closed shape of about unit radius; its vertices lie elsewhere by degrees."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [1, 2, 3])[:3, :3]
     vertices = np.asarray(ball.vertices) @ turn
     reach = np.ones(len(vertices))
@@ -159,6 +159,38 @@ def test_a_source_that_is_a_part_of_its_target(pair):
     # What the target shows besides is not held against it.
     assert result.report["trust"]["checks"]["remaining"] < 0.1
     assert not any("distance before is left" in reason for reason in result.trust.reasons)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_field_settles_as_noise_and_its_own_size_allow(noise):
+    """A small motion, seen in a coarse mesh with noise, is not drowned by following the noise."""
+    rng = np.random.default_rng(0)
+    here = oriented_points(organ(), 2400, rng)
+    here = here.at(evenly(here.points, 600))
+    coarse = organ(40.0, subdivisions=3)
+    off = noise * rng.normal(size=coarse.vertices.shape)
+    seen = Surface(coarse.vertices + bend(coarse.vertices, 0.05) + off, coarse.faces)
+    there = oriented_points(seen, 6000, rng)
+    truth, prior = bend(here.points, 0.05), SURFACE.at(here.points)
+    errors = []
+    for settling in (0, 6):
+        found = refine_on_surface(
+            Outline(here, NO_CURVE),
+            Outline(there, NO_CURVE, measured=len(seen.vertices)),
+            [np.zeros_like(truth)],
+            prior,
+            SurfaceOptions(settling=settling),
+        )
+        errors.append(np.linalg.norm(found.posterior.mean - truth, axis=1).mean())
+    # The prior allows motions ten times as large.
+    assert 0.1 <= found.scale < 0.4
+    assert errors[1] < 0.7 * errors[0]
+
+
+def bend(points, size):
+    """A smooth field (N, 3) at points (N, 3)."""
+    x, y = points[:, 0], points[:, 1]
+    return size * np.column_stack([np.sin(2 * y), np.cos(2 * x), x**2])
 
 
 def sheet_at(*heights):

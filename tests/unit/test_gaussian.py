@@ -164,3 +164,27 @@ def test_without_observations_a_posterior_is_the_prior():
 
 def prior_variance(prior):
     return (dense(prior) ** 2).sum(axis=1).reshape(-1, 3).sum(axis=1)
+
+
+def test_a_process_of_another_scale():
+    points = cloud(60)
+    root = covariance_root(points, WIDTHS, AMPLITUDES, AFFINE)
+    smaller = root.times(0.3)
+    again = covariance_root(points, WIDTHS, [0.3 * a for a in AMPLITUDES], 0.3 * AFFINE)
+    for found in (smaller.root, smaller.at(points)):
+        assert np.allclose(found, again.root, atol=1e-9)
+    amplitudes = np.random.default_rng(0).normal(size=(root.root.shape[1], 3))
+    assert np.allclose(smaller.field(points, amplitudes), 0.3 * root.root @ amplitudes, atol=1e-9)
+    prior = LinearGaussian(points, np.ones((2, 60, 3)), root.root).times(0.3)
+    assert np.array_equal(prior.mean, points)
+    assert np.array_equal(prior.modes, np.full((2, 60, 3), 0.3))
+
+
+def test_the_scale_is_found_again():
+    """Fields of a process, drawn with a scale and seen well, tell it."""
+    root = covariance_root(cloud(400), WIDTHS, AMPLITUDES, AFFINE).root
+    drawn = 0.2 * root @ np.random.default_rng(5).normal(size=(root.shape[1], 3))
+    precision = np.tile(1e8 * np.eye(3), (400, 1, 1))
+    posterior = Posterior(LinearGaussian.of_kernel(root), 1e8 * drawn, precision)
+    assert posterior.scale == pytest.approx(0.2, rel=0.25)
+    assert 0 < posterior.determined <= 3 * root.shape[1]

@@ -9,6 +9,7 @@ from dine.geometry.oriented import (
     OrientedPoints,
     evenly,
     fitted_planes,
+    fitted_quadrics,
     rim_curve,
     rim_edges,
     unit,
@@ -31,6 +32,34 @@ def test_normals_of_a_cloud_are_those_of_its_surface(sphere):
     # Of fewer points than neighbours too.
     flat = np.random.default_rng(1).normal(size=(5, 3)) * [1, 1, 0]
     assert np.allclose(np.abs(fitted_planes(flat)[0]), [0, 0, 1])
+
+
+def few_of_a_bent_surface():
+    """Few points of an ellipsoid, unevenly drawn as chance has it, and its normals."""
+    points = unit(np.random.default_rng(3).normal(size=(300, 3)))
+    axes = np.array([1.0, 0.7, 0.5])
+    return OrientedPoints(points * axes, unit(points / axes), np.zeros(300, bool))
+
+
+def test_quadrics_bend_with_the_surface():
+    bent = few_of_a_bent_surface()
+    off = turned_by(fitted_quadrics(bent.points), bent.normals)
+    assert off.mean() < 0.7 * turned_by(fitted_planes(bent.points)[0], bent.normals).mean()
+    # A flat surface stays flat, and of few points too.
+    for count in (5, 100):
+        flat = np.random.default_rng(1).normal(size=(count, 3)) * [1, 1, 0]
+        assert np.allclose(np.abs(fitted_quadrics(flat)), [0, 0, 1], atol=1e-6)
+
+
+def test_moving_normals_of_few_points_bend_with_the_surface():
+    bent = few_of_a_bent_surface()
+    matrix = np.array([[0.2, -1.5, 0.1], [0.9, 0.3, 0.0], [0.1, 0.2, 0.7]])
+    expected = unit(bent.normals @ np.linalg.inv(matrix))
+    flat, curved = (
+        turned_by(MovingNormals(bent, curved=curved)(bent.points @ matrix.T), expected).mean()
+        for curved in (False, True)
+    )
+    assert curved < 0.7 * flat
 
 
 @pytest.mark.parametrize("count", [100, 500])
