@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dine.geometry.distance import surface_distance
+from dine.geometry.distance import distances, surface_distance
 from dine.geometry.interpolation import FittedValues
+from dine.geometry.surface import Surface
 from dine.registration.calibration import Calibration, field_values
+from dine.registration.correspondence import aligned_pairs
 from dine.registration.shapes import dense_points
+from dine.registration.surfaces import CLOSE, improbabilities
 from dine.registration.types import (
     Correspondence,
     ExpectedError,
     Model,
     Motion,
+    Overlap,
     Pair,
     Settings,
     Trust,
@@ -35,6 +39,20 @@ _UNMET = 0.15
 _UNSURE = 0.06
 
 GOOD, DOUBTFUL, IMPLAUSIBLE = "plausible", "doubtful", "implausible"
+
+
+# Mean displacement, in radii, below which the scans lie on each other as they are.
+_LYING_ON = 0.03
+# What the mirrored source lowers the improbability to, if the target is its mirror image.
+_MIRROR_FITS = 0.7
+# What it lowers the mean distance of rigidly aligned points to, if it is looked at more closely.
+_MIRROR_NEARER = 0.9
+
+MIRRORED = (
+    "The target looks like a mirror image of the source, such as a left organ for a right one: "
+    "mirrored, the source fits much better. If the two are the same side, one file is flipped; "
+    "otherwise mirror one of them first (change the sign of one coordinate)."
+)
 
 
 @dataclass(frozen=True)
@@ -222,3 +240,32 @@ def _compared(
             # Four times what was ever seen is no matter of percentiles any more.
             serious += name in _SERIOUS and value > 4 * highest
     return percentiles, reasons, serious
+
+
+def mirrored(surface: Surface) -> Surface:
+    """The mirror image, in the plane across the first axis; normals of faces still point out."""
+    faces = None if surface.faces is None else surface.faces[:, ::-1]
+    return Surface(surface.vertices * [-1.0, 1.0, 1.0], faces, surface.name)
+
+
+def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> bool:
+    """Whether the mirror image of the source fits the target much better.
+
+    Judged before anything but stiff fields bends them, which make a shape its mirror image less
+    easily than the fields of a registration do. Symmetric objects fit as well either way.
+    """
+    near = np.linalg.norm(found.field, axis=1).mean() < _LYING_ON
+    if near or found.improbability is None or settings.overlap is not Overlap.AUTO:
+        return False
+    otherwise = aligned_pairs(
+        mirrored(pair.source), pair.target, replace(settings, prealign="auto"), "none"
+    )
+    if min(map(_apart, otherwise)) > _MIRROR_NEARER * _apart(pair):
+        return False
+    as_given = improbabilities([pair], settings, CLOSE)[0]
+    return min(improbabilities(otherwise, settings, CLOSE)) < _MIRROR_FITS * as_given
+
+
+def _apart(pair: Pair) -> float:
+    """Mean distance between the points of both scans as they are aligned, both ways."""
+    return float(distances(pair.start, pair.goal).mean() + distances(pair.goal, pair.start).mean())

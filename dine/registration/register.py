@@ -17,10 +17,15 @@ from dine.geometry.surface import Surface
 from dine.models.devices import chosen_device
 from dine.progress import stage
 from dine.refinement.refine import ROUNDS
-from dine.registration.assessment import Measures, assess, expected_error, measure
+from dine.registration.assessment import (
+    MIRRORED,
+    Measures,
+    assess,
+    expected_error,
+    looks_mirrored,
+    measure,
+)
 from dine.registration.correspondence import correspondence_of
-from dine.registration.mirrored import SENTENCE as MIRRORED
-from dine.registration.mirrored import looks_mirrored
 from dine.registration.model import load_model
 from dine.registration.shapes import (
     POINTS,

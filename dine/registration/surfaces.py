@@ -240,6 +240,9 @@ def _covered(end: OnSurface, overlap: Overlap) -> tuple[float, tuple[float, floa
     if overlap is Overlap.SOURCE_IN_TARGET:
         return source.unmet, (1.0, 0.0), np.zeros(len(source.met), bool)
     shown = tuple(1 - float(side.beyond.mean()) for side in (source, target))
+    if not any(shown):
+        # Nowhere near each other: then all of both should lie on the other, and does not.
+        return 1.0, (1.0, 1.0), source.beyond
     # What one scan lacks by a hole, the other does not.
     return min(source.unmet, target.unmet), shown, source.beyond
 

@@ -18,8 +18,8 @@ from dine.io.readers import read_surface
 from dine.io.writers import write_surface
 from dine.refinement.process import SURFACE
 from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
+from dine.registration.assessment import mirrored
 from dine.registration.correspondence import lacks
-from dine.registration.mirrored import mirrored
 from dine.registration.surfaces import oriented_points
 from dine.registration.types import Correspondence
 
