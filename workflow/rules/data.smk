@@ -39,8 +39,6 @@ use rule raw as raw_unseen with:
         settings=lambda wildcards: PLAN.unseen(wildcards.dataset),
         signature=lambda wildcards: PLAN.unseen_signature(wildcards.dataset),
         first=lambda wildcards: CONFIG.datasets[wildcards.dataset].recipe.objects,
-        seed=CONFIG.seed,
-        code=code_digest("raw"),
 
 
 rule pairs:

@@ -34,8 +34,6 @@ use rule raw as evidence_raw with:
         settings=lambda wildcards: PLAN.test_raw(wildcards.dataset),
         signature=lambda wildcards: PLAN.test_signature(wildcards.dataset),
         first=FIRST_TEST_OBJECT,
-        seed=CONFIG.seed,
-        code=code_digest("raw"),
 
 
 use rule pairs as evidence_pairs with:
@@ -50,8 +48,6 @@ use rule pairs as evidence_pairs with:
     params:
         more="--test-only",
         settings=lambda wildcards: PLAN.test_pairs(wildcards.dataset),
-        seed=CONFIG.seed,
-        code=code_digest("pairs"),
 
 
 use rule corrupt as evidence_corrupt with:
@@ -65,8 +61,6 @@ use rule corrupt as evidence_corrupt with:
         FILES.benchmark("evidence", "{dataset}", "variants", "{condition}_{corruption}")
     params:
         some=lambda wildcards: options("--at", PLAN.test_levels(wildcards.dataset)),
-        seed=CONFIG.seed,
-        code=code_digest("corrupt"),
 
 
 use rule resample as evidence_resample with:
@@ -80,10 +74,7 @@ use rule resample as evidence_resample with:
     benchmark:
         FILES.benchmark("evidence", "{dataset}", "variants", "resampled_1")
     params:
-        raws=lambda wildcards, input: options("--raw", input.raws),
         some=lambda wildcards: options("--at", PLAN.test_levels(wildcards.dataset)),
-        seed=CONFIG.seed,
-        code=code_digest("resample"),
 
 
 # λ of every method of its own, on the dataset and backbone of `lambda_search`.
@@ -104,8 +95,6 @@ use rule search_lambda as evidence_lambda with:
         ),
         stage2=lambda wildcards: PLAN.method_stage2(wildcards.trained),
         settings=lambda wildcards: PLAN.method_search(wildcards.trained),
-        seed=CONFIG.seed,
-        compute=COMPUTE,
         code=lambda wildcards: PLAN.method_code(
             wildcards.trained, "search-lambda", SEARCH.backbone
         ),
@@ -130,8 +119,6 @@ use rule stage2_control as stage2_method with:
         variant=lambda wildcards: wildcards.trained,
         prior=lambda wildcards, input: method_options(wildcards.trained, input),
         settings=lambda wildcards: PLAN.method_stage2(wildcards.trained),
-        seed=lambda wildcards: PLAN.seed(wildcards.backbone),
-        compute=COMPUTE,
         code=lambda wildcards: PLAN.method_code(
             wildcards.trained, "stage2", wildcards.backbone
         ),
@@ -166,10 +153,7 @@ use rule predict as evidence_predict with:
             "{network}_predict",
         )
     params:
-        variants=lambda wildcards, input: options("--variant", input.variants),
         name="{dataset}/{cell_backbone}/seed{seed}/{network}",
-        batch=CONFIG.evaluation.batch_size,
-        compute=COMPUTE,
         code=lambda wildcards: PLAN.code("predict", wildcards.cell_backbone),
 
 

@@ -19,8 +19,6 @@ use rule raw as pretraining_raw with:
         settings=lambda wildcards: PLAN.pretraining_raw(wildcards.shape),
         signature="",
         first=FIRST_PRETRAINING_OBJECT,
-        seed=CONFIG.seed,
-        code=code_digest("raw"),
 
 
 use rule pairs as pretraining_pairs with:
@@ -35,8 +33,6 @@ use rule pairs as pretraining_pairs with:
     params:
         more="",
         settings=PLAN.pretraining_pairs,
-        seed=CONFIG.seed,
-        code=code_digest("pairs"),
 
 
 # Two scans share no points: half of what is trained on has targets of other points, too.
@@ -51,10 +47,7 @@ use rule resample as pretraining_targets with:
     benchmark:
         FILES.benchmark("pretraining", "{shape}_targets")
     params:
-        raws=lambda wildcards, input: options("--raw", input.raws),
         some="",
-        seed=CONFIG.seed,
-        code=code_digest("resample"),
 
 
 rule pretrain:
@@ -92,7 +85,7 @@ rule pretrain:
 # What `dine register` needs beside the weights: a prior, and what uncertainty means.
 
 
-rule pretraining_fields:
+use rule fields as pretraining_fields with:
     input:
         model=PRETRAINED.model,
         pairs=SHAPE.pairs,
@@ -101,40 +94,26 @@ rule pretraining_fields:
         FILES.pretraining_fields("{backbone}", "{shape}"),
     log:
         FILES.log("pretraining", "{backbone}_fields_{shape}"),
-    conda:
-        "../envs/dine.yaml"
-    threads: THREADS
-    resources:
-        **request("prediction"),
+    benchmark:
+        FILES.benchmark("pretraining", "{backbone}_fields_{shape}")
     params:
-        compute=COMPUTE,
-        code=lambda wildcards: PLAN.code("fields", wildcards.backbone),
-    shell:
-        "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
-        " --pairs {input.pairs:q} --targets {input.targets:q} {params.compute}"
-        " --name 'pretraining/{wildcards.backbone}/{wildcards.shape}' --out {output:q}"
+        targets=lambda wildcards, input: options("--targets", [input.targets]),
+        name="pretraining/{backbone}/{shape}",
 
 
-rule pretraining_prior:
+use rule fit_prior as pretraining_prior with:
     input:
         [FILES.pretraining_fields("{backbone}", shape) for shape in SHAPES],
     output:
         PRETRAINED.prior,
     log:
         FILES.log("pretraining", "{backbone}_prior"),
-    conda:
-        "../envs/dine.yaml"
-    threads: THREADS
-    resources:
-        **request("prior"),
+    benchmark:
+        FILES.benchmark("pretraining", "{backbone}_prior")
     params:
-        fields=lambda wildcards, input: options("--fields", input),
         settings=section(dine_config.PriorConfig(kind="pca")),
         seed=CONFIG.seed,
         code=code_digest("fit-prior", "pca"),
-    shell:
-        "dine --log {log:q} --threads {threads} fit-prior {params.fields}"
-        " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
 
 
 use rule calibrate as pretraining_calibration with:
@@ -150,8 +129,6 @@ use rule calibrate as pretraining_calibration with:
     log:
         FILES.log("pretraining", "{backbone}_calibration"),
     params:
-        data=lambda wildcards, input: calibration_options(input),
-        device=CONFIG.device,
         code=lambda wildcards: code_digest(
             "calibrate", PLAN.backbone(wildcards.backbone).kind, "pca"
         ),

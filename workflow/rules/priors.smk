@@ -17,11 +17,12 @@ rule fit_prior:
     resources:
         **request("prior"),
     params:
+        fields=lambda wildcards, input: options("--fields", input),
         settings=lambda wildcards: PLAN.prior(wildcards.prior),
         seed=lambda wildcards: PLAN.seed(wildcards.backbone),
         code=lambda wildcards: PLAN.code("fit-prior", priors=[wildcards.prior]),
     shell:
-        "dine --log {log:q} --threads {threads} fit-prior --fields {input:q}"
+        "dine --log {log:q} --threads {threads} fit-prior {params.fields}"
         " --settings {params.settings:q} --seed {params.seed} --out {output:q}"
 
 
@@ -76,8 +77,5 @@ use rule search_lambda as search_own_lambda with:
         priors=lambda wildcards, input: options(
             "--prior", CONFIG.searched(wildcards.searching), input.priors
         ),
-        stage2=section(CONFIG.stage2),
         settings=lambda wildcards: PLAN.search(wildcards.searching),
-        seed=CONFIG.seed,
-        compute=COMPUTE,
         code=lambda wildcards: PLAN.search_code(wildcards.searching),

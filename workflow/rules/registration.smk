@@ -10,10 +10,7 @@ use rule resample as calibration_targets with:
     benchmark:
         FILES.benchmark("{dataset}", "resampled")
     params:
-        raws=lambda wildcards, input: options("--raw", input.raws),
         some="",
-        seed=CONFIG.seed,
-        code=code_digest("resample"),
 
 
 rule calibrate:

@@ -49,10 +49,12 @@ rule fields:
     resources:
         **request("prediction"),
     params:
+        targets="",
+        name="{dataset}/{backbone}/fields",
         batch=CONFIG.evaluation.batch_size,
         compute=COMPUTE,
         code=lambda wildcards: PLAN.code("fields", wildcards.backbone),
     shell:
         "dine --log {log:q} --threads {threads} fields --model {input.model:q}"
-        " --pairs {input.pairs:q} --batch-size {params.batch} {params.compute}"
-        " --name '{wildcards.dataset}/{wildcards.backbone}/fields' --out {output:q}"
+        " --pairs {input.pairs:q} {params.targets} --batch-size {params.batch} {params.compute}"
+        " --name '{params.name}' --out {output:q}"

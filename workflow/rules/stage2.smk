@@ -49,9 +49,6 @@ use rule stage2_control as stage2_prior with:
     params:
         variant=lambda wildcards: wildcards.prior_of_stage2,
         prior=lambda wildcards, input: prior_options(input.prior, input.weight),
-        settings=section(CONFIG.stage2),
-        seed=lambda wildcards: PLAN.seed(wildcards.backbone),
-        compute=COMPUTE,
         code=lambda wildcards: PLAN.code(
             "stage2",
             wildcards.backbone,
