@@ -5,39 +5,32 @@ Heavy modules (torch, matplotlib) are imported by the command that needs them.
 
 from __future__ import annotations
 
+import functools
+import importlib
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
 import click
 
 from dine import __version__
-from dine.cli import (
-    configuration,
-    console,
-    data,
-    evaluation,
-    organ,
-    registration,
-    reporting,
-    training,
-)
+from dine.cli import console
 from dine.cli.options import OUT
 from dine.errors import DineError
 from dine.extras import extras_needed
 
-# In the order of the help: what a command belongs to is the module that it is in.
+# In the order of the help: the module that its commands are in, and their names.
 GROUPS = {
-    "Register scans": registration,
-    "A prior of one organ": organ,
-    "Pairs to train and test on": data,
-    "Networks and priors": training,
-    "Predictions and metrics": evaluation,
-    "Results": reporting,
-    "Configurations": configuration,
+    "Register scans": ("registration", "register apply register-many scans calibrate"),
+    "A prior of one organ": ("organ", "simulate learn"),
+    "Pairs to train and test on": ("data", "inspect raw pairs corrupt resample agreement"),
+    "Networks and priors": ("training", "stage1 pretrain fields fit-prior search-lambda stage2"),
+    "Predictions and metrics": ("evaluation", "predict evaluate refine-predictions classical"),
+    "Results": ("reporting", "diagnose tables figures report examples evidence"),
+    "Configurations": ("configuration", "config"),
 }
+_MODULES = {name: module for module, names in GROUPS.values() for name in names.split()}
 
 
 # Of `dine` itself, and of each command: they are looked for behind its name, too.
@@ -48,31 +41,31 @@ SPEECH = {
 
 
 class _Commands(click.Group):
-    """Commands that are listed in groups."""
+    """Commands that are listed in groups, each imported where it is asked for."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.commands)
+        return list(_MODULES)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        return command_of(name) if name in _MODULES else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        widest = max(map(len, self.commands))
-        for title, module in GROUPS.items():
+        widest = max(map(len, _MODULES))
+        for title, (_, names) in GROUPS.items():
             with formatter.section(title):
-                formatter.write_dl(
-                    [
-                        (
-                            command.name.ljust(widest),
-                            command.get_short_help_str(formatter.width - widest - 6),
-                        )
-                        for command in _commands(module)
-                    ]
-                )
+                shown = formatter.width - widest - 6
+                helps = {name: command_of(name).get_short_help_str(shown) for name in names.split()}
+                formatter.write_dl([(name.ljust(widest), help) for name, help in helps.items()])
 
 
-def _commands(module: ModuleType) -> list[click.Command]:
-    """The commands of a module, without those that stand below another one."""
+@functools.cache
+def command_of(name: str) -> click.Command:
+    """The command of this name."""
+    module = importlib.import_module(f"dine.cli.{_MODULES[name]}")
     found = [x for x in vars(module).values() if isinstance(x, click.Command)]
-    below = [x for one in found if isinstance(one, click.Group) for x in one.commands.values()]
-    return [command for command in found if command not in below]
+    command = next(x for x in found if x.name == name)
+    _speaking(command)
+    return command
 
 
 @click.group(
@@ -111,10 +104,6 @@ def _call(begin: Callable[[], None]) -> Callable[..., None]:
 
 for _names, (_help, _) in SPEECH.items():
     cli.params.append(click.Option(_names, is_flag=True, help=_help))
-for _module in GROUPS.values():
-    for _command in _commands(_module):
-        cli.add_command(_command)
-        _speaking(_command)
 
 
 def main() -> None:

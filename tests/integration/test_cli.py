@@ -1,5 +1,6 @@
 """What the help of every command says, and in which form they speak."""
 
+import importlib
 import json
 import re
 import shlex
@@ -17,7 +18,9 @@ CONFIG = Path(__file__).resolve().parents[2] / "config.yaml"
 
 
 def leaves(group, path=()):
-    for name, command in group.commands.items():
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
         if isinstance(command, click.Group):
             yield from leaves(command, (*path, name))
         else:
@@ -38,6 +41,15 @@ def examples(command):
         else:
             current = None
     return [shlex.split(" ".join(line))[1:] for line in lines]
+
+
+@pytest.mark.parametrize(("module", "names"), cli.GROUPS.values())
+def test_every_command_of_a_module_is_listed(module, names):
+    commands = vars(importlib.import_module(f"dine.cli.{module}")).values()
+    groups = [x for x in commands if isinstance(x, click.Group)]
+    below = [x for group in groups for x in group.commands.values()]
+    found = [x.name for x in commands if isinstance(x, click.Command) and x not in below]
+    assert found == names.split()
 
 
 @pytest.mark.parametrize(
@@ -73,7 +85,7 @@ def test_commands_are_listed_in_groups():
     shown = CliRunner().invoke(cli.cli, ["--help"]).output
     listed = re.findall(r"^  ([a-z][\w-]+)  ", shown, re.MULTILINE)
     assert listed[0] == "register"
-    assert sorted(listed) == sorted(cli.cli.commands)
+    assert listed == cli.cli.list_commands(None)
     assert re.findall(r"^(\w.+):$", shown, re.MULTILINE) == ["Options", *cli.GROUPS]
 
 
