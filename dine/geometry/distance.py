@@ -16,6 +16,11 @@ def distances(a: np.ndarray, b: np.ndarray | cKDTree) -> np.ndarray:
     return tree.query(a)[0]
 
 
+def spacings(points: np.ndarray) -> np.ndarray:
+    """Distance (N,) of each of (N, 3) points to the nearest other one."""
+    return cKDTree(points).query(points, k=[2])[0][:, 0]
+
+
 def distance_measures(*directions: np.ndarray) -> dict[str, float]:
     """Numbers of the nearest distances (N,), not squared, in one direction or in both.
 

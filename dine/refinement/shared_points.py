@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dine.geometry.distance import spacings
 from dine.priors.gaussian import LinearGaussian
 from dine.refinement.em import Matches, Mixture
 
@@ -39,7 +40,7 @@ class SharedPoints:
         self._few = min(len(source), len(target)) <= _NEIGHBOURS
         if not self._few:
             self._tree = cKDTree(target)
-            self._spacing = np.median(self._tree.query(target, k=2)[0][:, 1])
+            self._spacing = np.median(spacings(target))
             self._neighbours = cKDTree(source).query(source, k=_NEIGHBOURS + 1)[1][:, 1:]
 
     def matches(self, field: np.ndarray) -> Matches:

@@ -24,6 +24,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
+from dine.geometry.distance import spacings
 from dine.geometry.oriented import (
     Curve,
     MovingNormals,
@@ -307,7 +308,10 @@ class _Search:
         self.normals = MovingNormals(self.source, curved=source.gaps > 0)
         self.least = np.cos(np.radians(options.steepest))
         self.asking = spread(len(self.target.points), looking)
-        self.spacings = (2 * _spacing(self.target.points), _spacing(self.source.points))
+        target_spacing, source_spacing = (
+            float(np.median(spacings(x.points))) for x in (self.target, self.source)
+        )
+        self.spacings = (2 * target_spacing, source_spacing)
         self.signs = (1.0, -1.0)
         self.places = cKDTree(self.target.points)
 
@@ -497,11 +501,6 @@ class _Search:
 def _tree(places: np.ndarray) -> cKDTree:
     """One that is soon made, for places (n, k) that are asked about once."""
     return cKDTree(places, balanced_tree=False, compact_nodes=False)
-
-
-def _spacing(points: np.ndarray) -> float:
-    """Median distance to the nearest other point."""
-    return float(np.median(cKDTree(points).query(points, k=2)[0][:, 1]))
 
 
 class _Rims:

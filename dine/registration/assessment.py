@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from dine.geometry.distance import distances, surface_distance
+from dine.geometry.distance import distances, spacings, surface_distance
 from dine.geometry.interpolation import FittedValues
 from dine.geometry.surface import Surface
 from dine.registration.calibration import Calibration, field_values
@@ -101,10 +100,12 @@ def measure(
     source, target = dense_points(pair.source), dense_points(pair.target)
     aligned = surface_distance(pair.alignment.align(source), target, shown=shown)
     after = surface_distance(motion(source), target, shown=shown)
-    # Points alone cannot tell a small motion from where they happened to be drawn.
+    # Points alone cannot tell a small motion from where they happened to be drawn: two draws from
+    # one surface are apart by their spacing.
     floor = 0.0
     if settings.surfaces:
-        floor = bool(shown[0]) * _spacing(target) + bool(shown[1]) * _spacing(source)
+        sides = (points for points, share in ((target, shown[0]), (source, shown[1])) if share)
+        floor = sum(float((spacings(points) ** 2).mean()) for points in sides)
     checks = {"remaining": _remaining(aligned["chamfer"], after["chamfer"], floor)}
     if correspondence.inconsistency is not None:
         checks["inconsistency"] = correspondence.inconsistency
@@ -121,12 +122,6 @@ def measure(
     values = field_values(start, field, goal, prior, shown=shown)
     before = surface_distance(source, target, shown=shown)
     return Measures(before, aligned, after, values, checks)
-
-
-def _spacing(points: np.ndarray) -> float:
-    """Mean squared distance of points to their nearest others: what two draws from one surface are
-    apart by."""
-    return float((cKDTree(points).query(points, k=[2])[0] ** 2).mean())
 
 
 def _remaining(before: float, after: float, floor: float) -> float:

@@ -8,12 +8,11 @@ from functools import partial
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from dine.data.batch import make_batch
 from dine.data.sampling import convention_order
 from dine.errors import ConfigError, DataError
-from dine.geometry.distance import distances
+from dine.geometry.distance import distances, spacings
 from dine.geometry.frame import Frame
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.rigid import (
@@ -283,7 +282,7 @@ def _from_part(start: np.ndarray, goal: np.ndarray, rounds: int) -> Corresponden
     part, whole = frame.normalise(goal), frame.normalise(start)
     back = refine(part, whole, options=Options(rounds, part=True)).mean * frame.scale
     places = goal + back
-    reach = _RETURN * float(np.median(cKDTree(start).query(start, k=2)[0][:, 1]))
+    reach = _RETURN * float(np.median(spacings(start)))
     supported = distances(start, places) < reach
     if supported.sum() < FEWEST:
         raise DataError(
