@@ -7,14 +7,7 @@ from typing import Any
 
 from dine.classical.methods import CLASSICAL
 from dine.errors import ConfigError
-from dine.evaluation.conditions import (
-    Condition,
-    each_pair,
-    evaluation_conditions,
-    prediction,
-    write_predictions,
-)
-from dine.evaluation.predictions import Prediction
+from dine.evaluation.conditions import each_pair, evaluation_conditions, write_predictions
 from dine.files import file_digest
 
 
@@ -38,10 +31,10 @@ def classical_predictions(
         raise ConfigError(
             f"The method {algorithm!r} does not take these arguments: {error}."
         ) from None
-
-    def fields(condition: Condition) -> Prediction:
-        moved, seconds = each_pair(condition, name, lambda _, *clouds: method(*clouds))
-        return prediction(condition, moved, seconds)
-
-    facts = {"pairs": file_digest(pairs_path), "name": name}
-    write_predictions(out, evaluation_conditions(pairs_path, variants), fields, **facts)
+    write_predictions(
+        out,
+        evaluation_conditions(pairs_path, variants),
+        lambda condition: each_pair(condition, name, lambda _, *clouds: method(*clouds)),
+        pairs=file_digest(pairs_path),
+        name=name,
+    )

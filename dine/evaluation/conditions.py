@@ -64,8 +64,8 @@ def each_pair(
     condition: Condition,
     name: str,
     register: Callable[[int, np.ndarray, np.ndarray], np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fields (P, N, 3) float32 and wall times (P,) of a method that takes one pair after another.
+) -> Prediction:
+    """Fields and wall times of a method that takes one pair after another.
 
     ``register`` gets a row, its source (N, 3) and its target (M, 3), float64. The target's points
     come in a shuffled order, so that no method can profit from theirs.
@@ -81,11 +81,6 @@ def each_pair(
             fields[row] = register(row, source.astype(float), target[order].astype(float))
             seconds[row] = time.perf_counter() - began
             progress.update()
-    return fields, seconds
-
-
-def prediction(condition: Condition, fields: np.ndarray, seconds: np.ndarray) -> Prediction:
-    """What :func:`each_pair` found, for :func:`write_predictions`."""
     return Prediction(
         condition.name, condition.corruption, condition.pairs.name, fields, None, seconds
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from dine.evaluation.conditions import (
     Condition,
     each_pair,
     evaluation_conditions,
-    prediction,
     write_predictions,
 )
 from dine.evaluation.predictions import Prediction, read_predictions
@@ -58,10 +58,10 @@ def refine_predictions(
                 settings, fitted, source, target, start.displacement[row].astype(float), deviation
             )
 
-        refined, seconds = each_pair(condition, name, register)
-        if start.seconds is not None:
-            seconds = seconds + start.seconds
-        return prediction(condition, refined, seconds)
+        refined = each_pair(condition, name, register)
+        if start.seconds is None:
+            return refined
+        return replace(refined, seconds=refined.seconds + start.seconds)
 
     facts = {"predictions": file_digest(predictions), "pairs": file_digest(pairs_path)}
     conditions = evaluation_conditions(pairs_path, variants)
