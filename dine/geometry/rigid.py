@@ -114,17 +114,13 @@ def rigid_alignments(
     With ``partial`` the target is brought onto the source, of which it is a part, and the inverse
     is returned: every point of the part has a counterpart in the whole, but not the other way.
     """
-    # In units of the object, or a tolerance would mean something else in metres.
-    centre = np.median(source, axis=0)
-    size = float(np.median(np.linalg.norm(source - centre, axis=1))) or 1.0
-    a, b = ((points - centre) / size for points in (source, target))
+    frame = _frame(source)
+    a, b = frame.normalise(source), frame.normalise(target)
     if partial:
         motions = [np.linalg.inv(motion) for motion in _motions(b, a, both_ways=False)]
     else:
         motions = _motions(a, b, both_ways=True)
-    for motion in motions:
-        motion[:3, 3] = size * motion[:3, 3] + centre - motion[:3, :3] @ centre
-    return motions
+    return [_in_units(motion, frame) for motion in motions]
 
 
 def overlapping_alignments(source: np.ndarray, target: np.ndarray) -> list[np.ndarray]:
@@ -135,9 +131,8 @@ def overlapping_alignments(source: np.ndarray, target: np.ndarray) -> list[np.nd
     McClure), from no motion and from rotations that cover all evenly. Which of them is right shows
     only once the source is deformed, so several are given, no two alike.
     """
-    centre = np.median(source, axis=0)
-    size = float(np.median(np.linalg.norm(source - centre, axis=1))) or 1.0
-    a, b = ((points - centre) / size for points in (source, target))
+    frame = _frame(source)
+    a, b = (frame.normalise(points) for points in (source, target))
     a, b = (points[evenly(points, _FEWER)] for points in (a, b))
     tree = cKDTree(b)
     found = [_robust(a, b, tree, start) for start in _robust_starts(a, b)]
@@ -147,9 +142,19 @@ def overlapping_alignments(source: np.ndarray, target: np.ndarray) -> list[np.nd
         apart = [np.linalg.norm(transformed(a, motion) - transformed(a, x), axis=1) for x in chosen]
         if len(chosen) <= _TRIED and min(x.mean() for x in apart) > _ALIKE:
             chosen.append(motion)
-    for motion in chosen:
-        motion[:3, 3] = size * motion[:3, 3] + centre - motion[:3, :3] @ centre
-    return chosen
+    return [_in_units(motion, frame) for motion in chosen]
+
+
+def _frame(points: np.ndarray) -> Frame:
+    """In which a tolerance means the same in metres: around the median of (N, 3) points."""
+    centre = np.median(points, axis=0)
+    return Frame(centre, float(np.median(np.linalg.norm(points - centre, axis=1))) or 1.0)
+
+
+def _in_units(motion: np.ndarray, frame: Frame) -> np.ndarray:
+    """A 4×4 motion within a frame as one of the original units."""
+    motion[:3, 3] = frame.scale * motion[:3, 3] + frame.center - motion[:3, :3] @ frame.center
+    return motion
 
 
 def _robust_starts(a: np.ndarray, b: np.ndarray) -> Iterator[np.ndarray]:
