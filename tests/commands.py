@@ -1,5 +1,6 @@
 """Calling the commands of ``dine`` from tests."""
 
+import click
 from click.testing import CliRunner
 
 from dine import cli
@@ -12,3 +13,14 @@ STAGE2 = '{"steps": 2, "validate_every": 2, "validation_pairs": 1}'
 def dine(*arguments):
     """Run a command in this process; errors of ours come through as exceptions."""
     return CliRunner().invoke(cli.cli, list(map(str, arguments)), catch_exceptions=False)
+
+
+def leaves(group, path=()):
+    """The names and commands below a group."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from leaves(command, (*path, name))
+        else:
+            yield (*path, name), command

@@ -10,21 +10,12 @@ from pathlib import Path
 import click
 import pytest
 from click.testing import CliRunner
+from commands import leaves
 
 from dine import cli
 from dine.io.readers import read_surface
 
 CONFIG = Path(__file__).resolve().parents[2] / "config.yaml"
-
-
-def leaves(group, path=()):
-    context = click.Context(group)
-    for name in group.list_commands(context):
-        command = group.get_command(context, name)
-        if isinstance(command, click.Group):
-            yield from leaves(command, (*path, name))
-        else:
-            yield (*path, name), command
 
 
 def examples(command):

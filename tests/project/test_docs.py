@@ -14,6 +14,7 @@ from pathlib import Path
 import click
 import pytest
 import yaml
+from commands import leaves
 from snakemake.cli import parse_args
 
 from dine import __version__, cli
@@ -97,11 +98,6 @@ def command_lines(program):
     ]
 
 
-def leaves(group):
-    for command in group.commands.values():
-        yield from leaves(command) if isinstance(command, click.Group) else [command]
-
-
 @pytest.fixture
 def in_checkout(monkeypatch):
     monkeypatch.chdir(ROOT)
@@ -112,7 +108,7 @@ def test_dine_command_lines_parse(words, in_checkout, monkeypatch):
     """Commands, options and their values are known; nothing is executed."""
     called = []
     monkeypatch.setattr(cli.cli, "callback", lambda **values: None)
-    for command in leaves(cli.cli):
+    for _, command in leaves(cli.cli):
         monkeypatch.setattr(command, "callback", lambda **values: called.append(values))
     assert not cli.cli.main(words, prog_name="dine", standalone_mode=False)
     assert called or {"--help", "-h", "--version"} & set(words)
@@ -123,7 +119,7 @@ def test_commands_named_in_the_text_exist(page):
     """``dine stage1 …`` in running text: the command at least is one of ours."""
     for named in re.findall(r"`dine ([a-z][\w-]*(?: [a-z][\w-]*)?)[^`]*`", page.read_text()):
         words = named.split()
-        command = cli.cli.commands.get(words[0])
+        command = cli.cli.get_command(None, words[0])
         assert command, f"{page.name}: dine {named}"
         if isinstance(command, click.Group) and len(words) > 1:
             assert words[1] in command.commands, f"{page.name}: dine {named}"

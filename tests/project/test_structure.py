@@ -141,3 +141,20 @@ def test_only_results_knows_where_a_run_keeps_its_files():
     for path in sorted(PACKAGE.rglob("*.py")):
         if path != PACKAGE / "results.py":
             assert not named.search(path.read_text()), path
+
+
+def test_contributing_names_what_is_there():
+    """Each path of its tables exists, and holds the names that follow it."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    (table,) = re.findall(r"\| what \| where \|\n((?:\|.+\n)+)", text)
+    content, named = "", 0
+    for token in re.findall(r"`([^` ]+)`", re.sub(r"^\|[^|]+\|", "|", table, flags=re.MULTILINE)):
+        if "/" in token:
+            content = (ROOT / token).read_text()
+            continue
+        named += 1
+        for name in token.split("."):
+            assert re.search(
+                rf"^\s*(?:def|class|rule) {name}\b|^{name}\b", content, re.MULTILINE
+            ), token
+    assert named > 10
