@@ -28,6 +28,8 @@ FEWEST_CLUSTERS = 5
 """With fewer, an interval from drawing them anew says next to nothing."""
 
 SIGNIFICANT = 0.05
+# Beside a 95 % interval, at either end.
+_TAIL = (1 - 0.95) / 2
 
 _GROUP = ["dataset", "backbone", "condition", "corruption"]
 _COMPARED = [
@@ -116,9 +118,8 @@ def cluster_bootstrap(
     *,
     samples: int = 2000,
     seed: int = 0,
-    confidence: float = 0.95,
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean of (P,) differences that belong to clusters (P,).
+    """95 % percentile bootstrap interval of the mean of (P,) differences of clusters (P,).
 
     Whole clusters are drawn with replacement, as many as there are, because pairs of one object are
     not independent: pairs drawn one by one would give too narrow an interval. With fewer than two
@@ -134,8 +135,7 @@ def cluster_bootstrap(
     sums = np.bincount(member, weights=differences)
     drawn = _drawn(count, samples, seed)
     means = (drawn @ sums) / (drawn @ sizes)
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(means, [tail, 1 - tail])
+    low, high = np.quantile(means, [_TAIL, 1 - _TAIL])
     return float(low), float(high)
 
 
@@ -331,8 +331,6 @@ def compare(
     reference: str,
     *,
     values: Sequence[str] = ("cd", "mce"),
-    samples: int = 2000,
-    seed: int = 0,
 ) -> pd.DataFrame:
     """Is a method better than a reference, by how much, and could it be chance?
 
@@ -358,8 +356,6 @@ def compare(
         method: the method in question.
         reference: what it is compared with.
         values: columns to compare.
-        samples: draws of the bootstrap.
-        seed: of the bootstrap.
 
     Raises:
         DataError: see ``paired``.
@@ -380,7 +376,7 @@ def compare(
                     for side in ("method", "reference")
                     for name, number in spread[side][_hashable((*key, level))].items()
                 }
-                measured = {**_difference(some, samples, seed), **_failures(some)}
+                measured = {**_difference(some), **_failures(some)}
                 records.append({**place, **names, **measured, **seeds})
     if not records:
         raise DataError(f"No pair has a {' or a '.join(values)} to compare.")
@@ -499,12 +495,12 @@ def _hashable(key: tuple) -> tuple:
     return tuple("all" if isinstance(x, float) and np.isnan(x) else x for x in key)
 
 
-def _difference(rows: pd.DataFrame, samples: int, seed: int) -> dict[str, float]:
+def _difference(rows: pd.DataFrame) -> dict[str, float]:
     """The columns of ``compare`` that follow from the aligned values of some pairs."""
     ours, theirs = rows["method"].mean(), rows["reference"].mean()
     difference = rows["difference"].to_numpy()
     clusters = rows["cluster"].to_numpy()
-    low, high = cluster_bootstrap(difference, clusters, samples=samples, seed=seed)
+    low, high = cluster_bootstrap(difference, clusters)
     return {
         "pairs": len(rows),
         "objects": rows["object"].nunique(),

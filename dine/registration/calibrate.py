@@ -206,16 +206,14 @@ def _in_bins(spread: np.ndarray, error: np.ndarray, edges: np.ndarray) -> list[n
 
 
 def _plot(calibration: Calibration, measured: _Measured, path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     spread, error, _ = measured
     edges = _edges(spread)
     groups = _in_bins(spread, error, edges)
     middle = [np.median(group) for group in _in_bins(spread, spread, edges)]
-    figure, axes = plt.subplots(figsize=(5.2, 4), layout="constrained")
+    figure = Figure(figsize=(5.2, 4), layout="constrained")
+    axes = figure.subplots()
     axes.plot(calibration.spread, calibration.error, color="#3f7fc4", label="expected error")
     axes.plot(
         calibration.spread, calibration.likely, "--", color="#3f7fc4", label="90 % of errors below"
@@ -237,4 +235,3 @@ def _plot(calibration: Calibration, measured: _Measured, path: Path) -> None:
     axes.set_title(f"{100 * inside:.0f} % of test errors within the 90 % bound", fontsize=10)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=150, format="png")
-    plt.close(figure)

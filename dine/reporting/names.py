@@ -133,8 +133,8 @@ def short(value: object) -> str:
     return minus(f"{value:.4g}") if isinstance(value, float) else str(value)
 
 
-def interval(low: float, high: float, decimals: int = 0) -> str:
-    return f"{signed(low, decimals)} to {signed(high, decimals)}"
+def interval(low: float, high: float) -> str:
+    return f"{signed(low, 0)} to {signed(high, 0)}"
 
 
 def change(relative: float, low: float, high: float) -> str:
