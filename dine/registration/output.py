@@ -22,11 +22,9 @@ from dine.io.writers import (
     write_moved,
     written_suffix,
 )
-from dine.registration.page import view_of
 from dine.registration.saved import ENDING, write_result
 from dine.registration.shapes import check_spaces
 from dine.registration.types import RegistrationResult
-from dine.viewer.view import write_view
 
 
 @dataclass(frozen=True)
@@ -127,6 +125,9 @@ def save(
         said += lost(surface)
         said += cannot_hold(path, write_moved(path, surface, overwrite=overwrite))
     if view:
+        from dine.registration.page import view_of
+        from dine.viewer.view import write_view
+
         shown = view_of(result, _aligned_source(result), scalars)
         write_view(outputs.view, shown, overwrite=overwrite)
     write_result(outputs.result, result)
