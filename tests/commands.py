@@ -10,6 +10,11 @@ STAGE1 = '{"steps": 3, "validate_every": 3, "validation_pairs": 1}'
 STAGE2 = '{"steps": 2, "validate_every": 2, "validation_pairs": 1}'
 
 
+def run(*arguments):
+    """Run a command in this process; errors of ours are in what comes back."""
+    return CliRunner().invoke(cli.cli, list(map(str, arguments)))
+
+
 def dine(*arguments):
     """Run a command in this process; errors of ours come through as exceptions."""
     return CliRunner().invoke(cli.cli, list(map(str, arguments)), catch_exceptions=False)
@@ -17,9 +22,7 @@ def dine(*arguments):
 
 def leaves(group, path=()):
     """The names and commands below a group."""
-    context = click.Context(group)
-    for name in group.list_commands(context):
-        command = group.get_command(context, name)
+    for name, command in group.commands.items():
         if isinstance(command, click.Group):
             yield from leaves(command, (*path, name))
         else:

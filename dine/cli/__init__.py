@@ -9,7 +9,7 @@ import functools
 import importlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import click
@@ -40,27 +40,38 @@ SPEECH = {
 }
 
 
-class _Commands(click.Group):
-    """Commands that are listed in groups, each imported where it is asked for."""
+class _Commands(Mapping[str, click.Command]):
+    """All commands, each imported where it is asked for."""
+
+    def __getitem__(self, name: str) -> click.Command:
+        return _imported(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULES)
+
+    def __len__(self) -> int:
+        return len(_MODULES)
+
+
+class _Groups(click.Group):
+    """Commands that are listed in groups."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_MODULES)
-
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        return command_of(name) if name in _MODULES else None
+        return list(self.commands)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         widest = max(map(len, _MODULES))
         for title, (_, names) in GROUPS.items():
             with formatter.section(title):
                 shown = formatter.width - widest - 6
-                helps = {name: command_of(name).get_short_help_str(shown) for name in names.split()}
+                helps = {
+                    name: self.commands[name].get_short_help_str(shown) for name in names.split()
+                }
                 formatter.write_dl([(name.ljust(widest), help) for name, help in helps.items()])
 
 
 @functools.cache
-def command_of(name: str) -> click.Command:
-    """The command of this name."""
+def _imported(name: str) -> click.Command:
     module = importlib.import_module(f"dine.cli.{_MODULES[name]}")
     found = [x for x in vars(module).values() if isinstance(x, click.Command)]
     command = next(x for x in found if x.name == name)
@@ -69,7 +80,9 @@ def command_of(name: str) -> click.Command:
 
 
 @click.group(
-    cls=_Commands, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}
+    cls=_Groups,
+    commands=_Commands(),
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(__version__, prog_name="dine")
 @click.option("--log", "log_file", type=OUT, help="Also write the log and results to this file.")

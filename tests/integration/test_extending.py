@@ -11,9 +11,9 @@ import pandas as pd
 import pytest
 import test_priors
 import torch
-from click.testing import CliRunner
+from commands import dine
 
-from dine import cli, config
+from dine import config
 from dine.data.batch import make_batch
 from dine.data.pairs import read_pairs
 from dine.data.prepare import prepare_pairs
@@ -58,10 +58,6 @@ def meshes(tmp_path_factory):
 def text(section, **changes):
     """A section of the configuration as a command's settings."""
     return json.dumps(section.model_dump(mode="json", exclude={"priors"}) | changes)
-
-
-def dine(*arguments):
-    return CliRunner().invoke(cli.cli, list(map(str, arguments)), catch_exceptions=False)
 
 
 @pytest.fixture(scope="module")

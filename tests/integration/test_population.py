@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from click.testing import CliRunner
+from commands import run
 
 import dine
-from dine.cli import cli
 from dine.errors import ConfigError, DataError, StorageError
 from dine.files import read_json
 from dine.geometry.surface import Surface
@@ -30,10 +29,6 @@ def organ(stretch=0.0, bend=0.0):
     x, y, z = (ball.vertices * [1, 0.7, 0.5]).T
     vertices = np.column_stack([(1 + stretch) * x, y, z + bend * x**2])
     return Surface(40 * vertices, ball.faces, name="organ")
-
-
-def run(*words):
-    return CliRunner().invoke(cli, [str(word) for word in words])
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import trimesh
-from click.testing import CliRunner
+from commands import run
 
 import dine
-from dine.cli import cli
 from dine.data.pairs import PAIR_DATASETS, PairSet, Variant, read_pairs, write_pairs, write_variant
 from dine.errors import CheckpointError, ConfigError, DataError, DineError
 from dine.geometry.distance import landmark_errors, surface_distance
@@ -516,10 +515,6 @@ def test_scans_of_different_spaces_are_refused(pair):
 
 
 # --- commands -------------------------------------------------------------------------------------
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli, [str(a) for a in arguments])
 
 
 # For what does not depend on how well it is registered.

@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from click.testing import CliRunner
+from commands import run
 
 import dine
-from dine.cli import cli
 from dine.errors import DataError, DineError, StorageError
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
@@ -154,10 +153,6 @@ def test_the_package_shows_what_it_has():
 
 
 # --- dine apply -------------------------------------------------------------------------------
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli, [str(a) for a in arguments])
 
 
 def test_apply_moves_files_later(result, tmp_path):

@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
+from samples import evaluation
 
 from dine.errors import DataError
 from dine.reporting import figures, views
@@ -17,21 +18,15 @@ def metrics():
     """Random numbers for three pairs per level, two backbones and three methods."""
     rng = np.random.default_rng(5)
     rows = [
-        {
-            "dataset": "deformedtissue",
-            "backbone": backbone,
-            "method": method,
-            "origin": "synthetic",
-            "pair": f"{level}-{pair}",
-            "object": "made-up",
-            "cluster": "made-up",
-            "seed": 0,
-            "mce": 0.1,
-            "level": level,
-            "condition": condition,
-            "corruption": corruption,
-            "cd": rng.uniform(1e-4, 9e-4),
-        }
+        evaluation(
+            backbone=backbone,
+            method=method,
+            pair=f"{level}-{pair}",
+            level=level,
+            condition=condition,
+            corruption=corruption,
+            cd=rng.uniform(1e-4, 9e-4),
+        )
         for backbone in ("robust_defreg", "deftransnet")
         for method in METHODS
         for level in (0.2, 0.7, 0.9)

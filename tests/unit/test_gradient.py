@@ -6,6 +6,7 @@ The fields are so small and the priors so quickly fitted that only the mechanics
 import numpy as np
 import pytest
 import torch
+from samples import sphere
 from test_priors import QUICK
 
 from dine.data.batch import make_batch
@@ -19,11 +20,6 @@ from dine.training.objective import Objective
 pytestmark = pytest.mark.numerical
 POINTS = 20
 OF_CLOUDS = [name for name in DATA_TERMS.names() if name != "l1"]
-
-
-def sphere(count, seed=0):
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
 SOURCE = sphere(POINTS)

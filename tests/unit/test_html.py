@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image, ImageChops, ImageStat
+from samples import evaluation
 
 from dine.errors import DataError
 from dine.reporting import figures, html, report, table
@@ -50,24 +51,15 @@ def made_up(gain, **changes):
     rng = np.random.default_rng(7)
     factor = {"stage1": 20e-4, "lambda0": 16e-4, "pca": 16e-4 * (1 - gain)}
     rows = [
-        {
-            "dataset": "deformedtissue",
-            "backbone": "robust_defreg",
-            "method": method,
-            "seed": 0,
-            "origin": "synthetic",
-            "pair": f"{level}-{pair}",
-            "object": "made-up",
-            "objects": "known",
-            "cluster": f"made-up/{pair}",
-            "level": level,
-            "condition": condition,
-            "corruption": corruption,
-            "cd": scale * shape,
-            "cd_observed": scale,
-            "cd_unregistered": 0.01,
-            "mce": 0.1,
-        }
+        evaluation(
+            method=method,
+            pair=f"{level}-{pair}",
+            cluster=f"made-up/{pair}",
+            level=level,
+            condition=condition,
+            corruption=corruption,
+            cd=scale * shape,
+        )
         for level in (0.1, 0.7)
         for pair in range(6)
         for condition, corruption in (("deformation", 0.0), ("noise", 0.03))

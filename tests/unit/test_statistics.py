@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pandas as pd
 import pytest
+from samples import only
 from scipy import stats
 
 from dine.errors import DataError
@@ -43,14 +44,6 @@ def rows(method, mce, *, seed=0, levels=(0.5,), per_object=1, **changes):
                 }
             )
     return pd.DataFrame(records)
-
-
-def only(table, **where):
-    for name, value in where.items():
-        missing = isinstance(value, float) and np.isnan(value)
-        table = table[table[name].isna() if missing else table[name] == value]
-    assert len(table) == 1
-    return table.iloc[0]
 
 
 # ----------------------------------------------------------------------------- small functions

@@ -3,6 +3,7 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from samples import evaluation, only
 
 from dine.errors import DataError
 from dine.reporting import tables
@@ -21,29 +22,7 @@ def paper_table(number, metrics, spread=0.0):
 
 
 def row(method, pair, cd, **changes):
-    """One made-up evaluation; distances that a test does not look at follow from ``cd``."""
-    values = {
-        "dataset": "deformedtissue",
-        "backbone": "robust_defreg",
-        "method": method,
-        "seed": 0,
-        "origin": "synthetic",
-        "pair": pair,
-        "object": "made-up",
-        "objects": "known",
-        "cluster": f"made-up/{pair}",
-        "level": 0.7,
-        "condition": "deformation",
-        "corruption": 0.0,
-        "cd": cd,
-        "cd_observed": 2 * cd,
-        "cd_unregistered": 0.01,
-        "mce": 10 * cd,
-        "roughness_true": 0.25,
-        **dict.fromkeys(("hd95", "accuracy_2_5", "accuracy_5", "far_points"), 0.5),
-        **dict.fromkeys(("folding", "roughness", "seconds"), 0.5),
-    }
-    return {**values, **changes}
+    return evaluation(**{"method": method, "pair": pair, "cd": cd, "mce": 10 * cd, **changes})
 
 
 @pytest.fixture
@@ -58,15 +37,6 @@ def metrics():
             for name, cd in zip("ab", pair, strict=True)
         ]
     )
-
-
-def only(data, **where):
-    for name, value in where.items():
-        data = data[
-            np.isclose(data[name], value) if isinstance(value, float) else data[name] == value
-        ]
-    assert len(data) == 1
-    return data.iloc[0]
 
 
 def cells(table, source, label):

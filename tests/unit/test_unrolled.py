@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from samples import sphere
 
 from dine.data.batch import make_batch
 from dine.errors import ConfigError
@@ -12,11 +13,6 @@ from dine.refinement.refine import Observed, Options, refine
 from dine.training.unrolled import RefinedTerm
 
 pytestmark = pytest.mark.numerical
-
-
-def sphere(count, seed=0):
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
 def bent(points):

@@ -7,20 +7,15 @@ import pandas as pd
 import pytest
 import trimesh
 import yaml
-from click.testing import CliRunner
+from commands import dine as run
 from test_workflow import ROOT, copy_workflow, planned, snakemake
 
-from dine.cli import cli
 from dine.data.pairs import read_pairs
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_surface
 
 NAMES = ("-dash", 'Gewebe – äöü 組織, it\'s "quoted" $HOME `x` & more')
-
-
-def run(*arguments):
-    return CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
 
 
 def dataset(folder):

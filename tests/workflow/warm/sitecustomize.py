@@ -171,7 +171,7 @@ def read_code():
     from dine.provenance import code_digest
     from dine.training.data_terms import DATA_TERMS
 
-    for command in cli.list_commands(None):
+    for command in cli.commands:
         with contextlib.suppress(KeyError):  # a group of commands
             code_digest(command)
     for registry in (BACKBONES, CLASSICAL, DATA_TERMS, PRIORS):
