@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -156,7 +156,14 @@ def build_evidence(
     settings = config.get("evidence") or {}
     aside = [*(settings.get("backbones") or {}), *(settings.get("test_sets") or {})]
     spread = (config.get("evaluation") or {}).get("training_spread", Evaluation().training_spread)
-    evidence = EvidenceStatistics(load_metrics(files.metrics), methods, reference, aside, spread)
+    metrics = load_metrics(files.metrics)
+    # What cannot be used is refused before anything is computed.
+    datasets = set(metrics["dataset"])
+    searches = _read_all(files.searches, "backbone curve", datasets)
+    diagnostics = _read_all(files.diagnostics, "backbone prior", datasets)
+    for example in files.examples:
+        _check_dataset(example.dataset, example.png, datasets)
+    evidence = EvidenceStatistics(metrics, methods, reference, aside, spread)
 
     def drawn(name: str, caption: str, figure: Figure | None) -> Part | None:
         if figure is None:
@@ -168,9 +175,9 @@ def build_evidence(
         _levels(evidence, drawn),
         _answers(evidence, drawn),
         _corrupted(evidence),
-        _plausibility(evidence, _read_all(files.searches, "backbone curve", evidence), drawn),
+        _plausibility(evidence, searches, drawn),
         PageSection("seeds", "Seeds", [seed_table(evidence)]),
-        _priors(evidence, _read_all(files.diagnostics, "backbone prior", evidence)),
+        _priors(evidence, diagnostics),
         _examples(evidence, files.examples),
         _methods(evidence, config),
     ]
@@ -280,8 +287,6 @@ def _priors(evidence: EvidenceStatistics, found: Sequence[Mapping[str, Any]]) ->
 
 
 def _examples(evidence: EvidenceStatistics, examples: Sequence[ExamplePicture]) -> PageSection:
-    for example in examples:
-        _check_dataset(example.dataset, example.png, evidence)
     pictures = [picture(f"{evidence.where(x.dataset)}: {x.caption}", x.png) for x in examples]
     return PageSection("examples", "Examples", pictures)
 
@@ -294,7 +299,7 @@ def _methods(evidence: EvidenceStatistics, config: Mapping[str, Any]) -> PageSec
 
 
 def _read_all(
-    paths: Sequence[Path], needed: str, evidence: EvidenceStatistics
+    paths: Sequence[Path], needed: str, datasets: Collection[str]
 ) -> list[dict[str, Any]]:
     """Records of datasets that the metrics have, with the picture beside as ``png``."""
     found = []
@@ -304,13 +309,13 @@ def _read_all(
         missing = [key for key in keys if not isinstance(record, dict) or key not in record]
         if missing:
             raise DataError(f"{path} lacks {', '.join(missing)}.")
-        _check_dataset(record["dataset"], path, evidence)
+        _check_dataset(record["dataset"], path, datasets)
         found.append(record | {"png": path.with_suffix(".png")})
     return found
 
 
-def _check_dataset(dataset: str, path: Path, evidence: EvidenceStatistics) -> None:
-    if dataset not in evidence.datasets:
+def _check_dataset(dataset: str, path: Path, datasets: Collection[str]) -> None:
+    if dataset not in datasets:
         raise DataError(f"{path} is of {dataset}, of which there are no metrics.")
 
 

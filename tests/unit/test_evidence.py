@@ -636,11 +636,11 @@ def test_files_of_unknown_datasets_are_refused(tmp_path):
     picture = ExamplePicture("moon", tmp_path / "x.png", "")
     with pytest.raises(DataError, match="is of moon"):
         build_evidence(Files(paths, examples=[picture]), tmp_path, methods={})
-    assert not (tmp_path / "report.html").exists()
+    assert not any((tmp_path / name).exists() for name in ("report.html", "figures"))
 
 
 def test_backbones_of_the_evidence_alone_decide_nothing():
-    metrics = made_up(datasets=("synbench",), seeds=1)
+    metrics = made_up(datasets=("synbench",), seeds=1, corrupted=False)
     # With the backbone on trial only the reference and PCA were evaluated.
     some = metrics[metrics["method"].isin(["lambda0", "pca"])]
     some = some[some["backbone"] == "deftransnet"].assign(backbone="on_trial")
@@ -662,7 +662,8 @@ def test_backbones_of_the_evidence_alone_decide_nothing():
 
 
 def test_test_sets_are_shown_and_decide_nothing():
-    metrics = made_up(seeds=1, corrupted=False)
+    effects = {name: EFFECTS[name] for name in ("unregistered", "cpd", "lambda0", "pca", "map")}
+    metrics = made_up(effects, seeds=1, corrupted=False)
     few = metrics[metrics["dataset"] == "synbench"].assign(dataset="scans", origin="path")
     both = pd.concat([metrics, few[few["level"] < 0.4]], ignore_index=True)
     plain, aside = (
