@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from dine.config import STAGE1, ClassicalMethod, Config
+from dine.config import STAGE1, ClassicalMethod, Config, Corruption, Evidence
 
 CLEAN = "deformation"
 
@@ -185,11 +185,12 @@ class EvidenceFiles:
 
 def conditions(config: Config, dataset: str) -> list[tuple[str, float]]:
     """The corrupted conditions of a dataset, and that of targets with other points."""
-    corruption = config.datasets[dataset].corruption
-    found = [("noise", x) for x in corruption.noise] + [
-        ("outliers", x) for x in corruption.outliers
-    ]
-    return found + ([("resampled", 1.0)] if corruption.resampled else [])
+    return _conditions(config.datasets[dataset].corruption)
+
+
+def _conditions(asked: Corruption | Evidence) -> list[tuple[str, float]]:
+    found = [(kind, x) for kind in ("noise", "outliers") for x in getattr(asked, kind)]
+    return found + ([("resampled", 1.0)] if asked.resampled else [])
 
 
 def strengths(config: Config, dataset: str) -> list[str]:
@@ -273,14 +274,9 @@ def evidence_conditions(config: Config, dataset: str) -> list[tuple[str, float]]
 
     Test sets are corrupted by nothing: their levels are their own.
     """
-    evidence = config.evidence
-    found = [("resampled", 1.0)] if evidence.resampled else []
-    if dataset in evidence.test_sets:
-        return found
-    noise, outliers = (
-        [(kind, x) for x in getattr(evidence, kind)] for kind in ("noise", "outliers")
-    )
-    return [*noise, *outliers, *found]
+    found = _conditions(config.evidence)
+    own_levels = dataset in config.evidence.test_sets
+    return [x for x in found if x[0] == "resampled"] if own_levels else found
 
 
 def evidence_names(config: Config, kind: type) -> list[str]:
