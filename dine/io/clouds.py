@@ -15,7 +15,8 @@ from dine.io.meshes import nothing_in
 
 # Without names for its columns a wider table is something else than points.
 _MOST_COLUMNS = 12
-_COMMENT = re.compile(r"^\s*(?:#|//)")
+_COMMENT = re.compile(r"^\s*(?:#|//|%|!|;\s|sep=.$)")
+_DOUBLE = re.compile(r"([-+]?[\d.]+)[dD]([-+]?\d+)")
 # At least one comma within a number, and none between them.
 _DECIMAL_COMMAS = re.compile(r"(?=.*,)[-+\d.e]+(?:,[\de+-]+)?(?:\s+[-+\d.e]+(?:,[\de+-]+)?){2,}")
 # "x", "X [mm]", "Points:0", "pos_y": an axis, perhaps after a word for points and before a unit.
@@ -31,7 +32,7 @@ def read_table(path: Path, data: bytes) -> Surface:
     Columns are parted by commas, semicolons or white space; a line that counts the rows may stand
     first.
     """
-    lines, names = _lines(path, data.decode("utf-8", "replace"))
+    lines, names, titled = _lines(path, text.decoded(data))
     width = len(lines[0])
     axes = [0, 1, 2] if names is None else _axes(path, names)
     if names is None and not 3 <= width <= _MOST_COLUMNS:
@@ -47,19 +48,20 @@ def read_table(path: Path, data: bytes) -> Surface:
                 f"{path} counts its rows in its first column; remove it, or write a line above "
                 "that names the columns (x, y, z)."
             )
-    return Surface(table, name=str(path), left_out=_others(width, axes, names))
+    left_out = ("lines above the names of the columns",) * titled
+    return Surface(table, name=str(path), left_out=_others(width, axes, names) + left_out)
 
 
 def read_indices(path: Path, data: bytes) -> np.ndarray:
     """(F, 3) numbers of a ``.triangle`` file."""
-    lines, _ = _lines(path, data.decode("utf-8", "replace"))
+    lines, _, _ = _lines(path, text.decoded(data))
     if len(lines[0]) != 3:
         raise DataError(f"{path} has {len(lines[0])} columns; expected 3 vertex indices a row.")
     return numbers(path, lines)
 
 
-def _lines(path: Path, content: str) -> tuple[list[list[str]], list[str] | None]:
-    """Fields of every row, and the names of the columns, if there are any."""
+def _lines(path: Path, content: str) -> tuple[list[list[str]], list[str] | None, bool]:
+    """Fields of every row, the names of the columns, if any, and whether titles stand above."""
     rows, above = [], ""
     for line in filter(None, map(str.strip, content.splitlines())):
         if not _COMMENT.match(line):
@@ -70,20 +72,18 @@ def _lines(path: Path, content: str) -> tuple[list[list[str]], list[str] | None]
         raise DataError(f"{path} holds no rows; expected columns of x, y and z.")
     if ";" in rows[-1] or _DECIMAL_COMMAS.fullmatch(rows[-1]):
         rows = [row.replace(",", ".") for row in rows]
-    delimiter = next((mark for mark in ";," if mark in rows[-1]), None)
+    delimiter = next((mark for mark in ";,|" if mark in rows[-1]), None)
     fields = [_fields(row, delimiter) for row in rows]
-    if len(fields[0]) == 1 and fields[0][0].isdigit() and len(fields) > 1:
-        count, fields = int(fields[0][0]), fields[1:]
-        if count != len(fields) or len(fields[0]) == 1:
-            raise DataError(
-                f"{path} is not a table of points: its first line announces {count} rows, and "
-                f"{len(fields)} follow; repair or convert it."
-            )
-    names = None
+    if any(map(_DOUBLE.fullmatch, fields[-1])):
+        fields = [[_DOUBLE.sub(r"\1e\2", field) for field in row] for row in fields]
+    if _is_count(fields[0]) and len(fields) > 1:
+        fields = _uncounted(path, fields)
+    names, titles = None, _titles(fields)
+    fields = fields[titles:]
     if not any(map(_is_number, fields[0])):
         names, fields = fields[0], fields[1:]
     else:  # perhaps a comment names them
-        said = _fields(above.lstrip("#/ "), delimiter)
+        said = _fields(above.lstrip("#/%!; "), delimiter)
         names = said if len(said) == len(fields[0]) and len(_found_axes(said)) == 3 else None
     if not fields:
         raise DataError(f"{path} holds no rows; expected columns of x, y and z.")
@@ -94,10 +94,42 @@ def _lines(path: Path, content: str) -> tuple[list[list[str]], list[str] | None]
             f"{path} is not a table: the number of columns changed from {width} to {len(odd)} at "
             f"{' '.join(odd)[:40]!r}; repair or convert it."
         )
-    return fields, names
+    return fields, names, titles > 0
+
+
+def _is_count(row: list[str]) -> bool:
+    return len(row) == 1 and row[0].isdigit()
+
+
+def _uncounted(path: Path, fields: list[list[str]]) -> list[list[str]]:
+    """Rows of a table, or of several, each below a line with its number of rows."""
+    found, at = [], 0
+    while at < len(fields):
+        count = int(fields[at][0]) if _is_count(fields[at]) else 0
+        rows = fields[at + 1 : at + 1 + count]
+        if len(rows) != count or not rows or len(rows[0]) == 1:
+            raise DataError(
+                f"{path} is not a table of points: its first line announces {fields[0][0]} rows, "
+                f"and {len(fields) - 1} follow; repair or convert it."
+            )
+        found += rows
+        at += 1 + count
+    return found
+
+
+def _titles(fields: list[list[str]]) -> int:
+    """How many lines stand above the one that names the columns, before any row of numbers."""
+    for place, row in enumerate(fields):
+        if len(_found_axes(row)) == 3:
+            return place
+        if all(map(_is_number, row)):
+            break
+    return 0
 
 
 def _fields(row: str, delimiter: str | None) -> list[str]:
+    if delimiter is None:
+        row = re.sub(r"\s+(?=[\[(])", "", row)  # units: x (mm) y (mm) z (mm)
     fields = [field.strip().strip("\"'") for field in row.split(delimiter)]
     return fields[:-1] if len(fields) > 1 and not fields[-1] else fields
 
@@ -197,9 +229,8 @@ def read_pcd(path: Path, data: bytes) -> Surface:
             packed = np.ascontiguousarray(values.pop(name)).view("<u4").reshape(-1)
             shifts = (16, 8, 0, 24) if name == "rgba" else (16, 8, 0)
             values["colors"] = np.column_stack([packed >> s & 255 for s in shifts]).astype(np.uint8)
-    if any(values.pop(f"normal_{axis}", None) is not None for axis in "xyz"):
-        left_out.append("normals")
-    values.pop("curvature", None)
+    normals = [values.pop(f"normal_{axis}", None) for axis in "xyz"]
+    left_out += ["normals"] * any(normal is not None for normal in normals)
     return Surface(points[measured], None, str(path), values, left_out=tuple(left_out))
 
 
@@ -209,6 +240,8 @@ def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
         raise ValueError("its header does not end with a line DATA")
     lines = text.rows(data[: found.end()])
     header = {line.split()[0].decode(): line.decode("ascii").split()[1:] for line in lines}
+    if {"WIDTH", "HEIGHT"} <= header.keys():  # before version 0.7 the only ones
+        header.setdefault("POINTS", [str(int(header["WIDTH"][0]) * int(header["HEIGHT"][0]))])
     missing = {"FIELDS", "SIZE", "TYPE", "POINTS"} - header.keys()
     if missing:
         raise ValueError(f"its header lacks {', '.join(sorted(missing))}")

@@ -80,6 +80,8 @@ class _Obj:
             return
         parts = [value.split("/") for value in values]
         corners = [_from_one(part[0], len(self.vertices)) for part in parts]
+        if min(corners) < 0 or "0" in (part[0] for part in parts):
+            raise ValueError(f"the face '{' '.join(values)}' names no vertex: they count from 1")
         textured = all(len(part) > 1 and part[1] for part in parts)
         places = [_from_one(part[1], len(self.coordinates)) if textured else -1 for part in parts]
         for kept, (first, *others) in ((self.faces, corners), (self.texture, places)):
@@ -115,7 +117,7 @@ def _from_one(index: str, count: int) -> int:
 def read_obj(path: Path, data: bytes) -> Surface:
     """A mesh or cloud; trimesh would split vertices along textures and materials."""
     found = _Obj()
-    for line in re.sub(r"\\\r?\n", " ", data.decode("utf-8", "replace")).splitlines():
+    for line in re.sub(r"\\\r?\n", " ", text.decoded(data)).splitlines():
         found.take(line)
     if not found.vertices:
         raise nothing_in(path)
@@ -131,23 +133,39 @@ def read_obj(path: Path, data: bytes) -> Surface:
 
 
 def read_off(path: Path, data: bytes) -> Surface:
-    """A mesh or cloud of Geomview's OFF, COFF, NOFF and STOFF, as text."""
+    """A mesh or cloud of Geomview's OFF, COFF, NOFF and STOFF, as text; the word may be missing."""
     rows = [row.split() for row in text.rows(data)]
-    kind = re.fullmatch(rb"(ST)?(C)?(N)?OFF", rows[0][0] if rows else b"")
-    if kind is None:
-        raise ValueError("its first word is not OFF, COFF, NOFF or STOFF")
-    counts = rows.pop(0)[1:] or rows.pop(0)
+    first = rows[0][0] if rows else b""
+    kind = re.fullmatch(rb"(ST)?(C)?(N)?OFF", first.upper() if first.islower() else first)
+    if kind is None and not first.isdigit():
+        other = re.fullmatch(rb"(?:ST)?C?N?(?:4|4?n)OFF", first)
+        raise ValueError(
+            "its points are not of three dimensions"
+            if other
+            else "its first word is not OFF, COFF, NOFF or STOFF"
+        )
+    if kind is not None:
+        rows[0] = rows[0][1:]
+        if rows[0][:1] == [b"BINARY"]:
+            raise DataError(f"{path} is binary OFF, which is not read; export it as text.")
+    (st, c, n), rows = kind.groups() if kind else (None,) * 3, [row for row in rows if row]
+    counts = rows.pop(0)
     vertices, faces = int(counts[0]), int(counts[1])
-    if min(vertices, faces) < 0 or len(rows) < vertices + faces:
+    if min(vertices, faces) < 0:
+        raise ValueError("it announces a negative number of rows")
+    if len(rows) < vertices + faces:
+        width = 3 + (3 if n else 0) + (4 if c else 0) + (2 if st else 0)
+        rows = _off_rows([*counts[3:], *itertools.chain(*rows)], vertices, faces, width)
+    if rows is None:
         raise DataError(f"{path} is cut short: it has fewer rows than it announces; copy it again.")
     if vertices == 0:
         raise nothing_in(path)
     if len({len(row) for row in rows[:vertices]}) > 1:
         raise ValueError("its vertices have different numbers of columns")
     table = np.array(rows[:vertices], dtype=np.float64)
-    values, left_out = {}, ["normals"] if kind[3] else []
-    more = table[:, 6 if kind[3] else 3 :]
-    if kind[1]:
+    values, left_out = {}, ["normals"] if n else []
+    more = table[:, 6 if n else 3 :]
+    if st:
         more, values["texture_coordinates"] = more[:, :-2], more[:, -2:]
     colors = colors_of(more)
     if colors is not None:
@@ -172,20 +190,44 @@ def read_off(path: Path, data: bytes) -> Surface:
     return Surface(table[:, :3], found, str(path), values, left_out=tuple(left_out))
 
 
+def _off_rows(
+    words: list[bytes], vertices: int, faces: int, width: int
+) -> list[list[bytes]] | None:
+    """Rows of a file that has its line ends elsewhere; None if its words do not make these."""
+    if len(words) < width * vertices:
+        return None
+    rows = [words[width * i : width * (i + 1)] for i in range(vertices)]
+    at = width * vertices
+    for _ in range(faces):
+        if at >= len(words):
+            return None
+        stop = at + 1 + max(int(words[at]), 0)
+        rows.append(words[at:stop])
+        at = stop
+    return rows if at == len(words) else None
+
+
 # --- STL --------------------------------------------------------------------------------------
 
 #: One triangle of a binary file.
 FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
+# Where the solid begins, behind lines that say who made it.
+_SOLID = re.compile(rb"(?:[ \t]*(?:[#;/][^\r\n]*)?[\r\n])*[ \t]*solid", re.IGNORECASE)
+_STL_WORDS = re.compile(
+    rb"\s+(?=(?:facet\s+normal|outer\s+loop|vertex|endloop|endfacet|endsolid|solid)\b)",
+    re.IGNORECASE,
+)
+_SAME_LINE = re.compile(rb"vertex(?:[ \t]+[-+.\de]+){3}[ \t]+[a-z]", re.IGNORECASE)
 
 
 def read_stl(path: Path, data: bytes) -> Surface:
     """A mesh of three vertices for each triangle, of all solids in the file, text or binary."""
     count = int.from_bytes(data[80:_HEADER], "little")
     rest = len(data) - _HEADER - count * FACET.itemsize
-    plain = text.without_mark(data).lstrip()
+    plain = text.without_mark(data) if rest != 0 else b""
     # The header of a binary file may say "solid" as well; no text has zeros.
-    if rest != 0 and plain[:5].lower() == b"solid" and b"\0" not in plain[:_HEADER]:
+    if _SOLID.match(plain) and b"\0" not in plain[:_HEADER]:
         corners, left_out = _text_stl(path, plain), []
     else:
         if rest < 0:
@@ -207,6 +249,8 @@ def _text_stl(path: Path, data: bytes) -> np.ndarray:
     """Corners (3 F, 3) of all solids; what stands between them is left out."""
     corners: list[list[bytes]] = []
     solid, facets = False, 0
+    if _SAME_LINE.search(data[:1000]):  # it has its line ends elsewhere
+        data = _STL_WORDS.sub(b"\n", data)
     for line in data.splitlines():
         word, *values = line.split() or [b""]
         word = word.lower()

@@ -13,14 +13,19 @@ import numpy as np
 from dine.errors import DataError
 from dine.geometry.surface import Surface
 from dine.io import polygons, text
+from dine.io.meshes import colors_of
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _TYPES |= {"float": "f4", "double": "f8"}
-_TYPES |= {f"{k}{8 * n}": f"{k[0]}{n}" for k in ("int", "uint") for n in (1, 2, 4)}
+_TYPES |= {f"{k}{8 * n}": f"{k[0]}{n}" for k in ("int", "uint") for n in (1, 2, 4, 8)}
 _TYPES |= {"float32": "f4", "float64": "f8"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_indices", "vertex_index")
 _NORMALS = {"nx", "ny", "nz"}
+_COLORS = [
+    [f"{prefix}{n}" for n in ("red", "green", "blue", "alpha")] for prefix in ("", "diffuse_")
+]
+_COLORS.append(["r", "g", "b", "a"])
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ def read_ply(path: Path, data: bytes) -> Surface:
         ValueError: damaged.
     """
     kind, elements, body = _header(data)
-    rows = iter(text.rows(body)) if kind == "ascii" else None
+    rows = iter(_lines(elements, body)) if kind == "ascii" else None
     tables, start = {}, 0
     for element in elements:
         if rows is not None:
@@ -64,6 +69,8 @@ def read_ply(path: Path, data: bytes) -> Surface:
             tables[element.name], start = _binary_rows(element, body, start, _ORDERS[kind])
     _check_end(list(rows) if rows is not None else body[start:])
     vertex = tables.pop("vertex", {})
+    if "x" not in vertex:
+        vertex = {name.lower(): column for name, column in vertex.items()}
     if not {"x", "y", "z"} <= vertex.keys() or len(vertex["x"]) == 0:
         raise DataError(
             f"{path} holds no mesh and no points, or is cut short; expected a .ply file with "
@@ -100,9 +107,9 @@ def _header(data: bytes) -> tuple[str, list[_Element], bytes]:
         elif words[0] == "element" and len(words) == 3:
             elements.append(_Element(words[1], int(words[2])))
         elif words[0] == "property" and len(words) == 3 and elements:
-            elements[-1].properties[words[2]] = (_TYPES[words[1]], None)
+            elements[-1].properties[words[2]] = (_type(words[1]), None)
         elif words[:2] == ["property", "list"] and len(words) == 5 and elements:
-            elements[-1].properties[words[4]] = (_TYPES[words[3]], _TYPES[words[2]])
+            elements[-1].properties[words[4]] = (_type(words[3]), _type(words[2]))
         elif words[0] not in ("comment", "obj_info"):
             raise ValueError(f"its header has the line {line!r}")
     if not kind or any(element.count < 0 for element in elements):
@@ -110,7 +117,35 @@ def _header(data: bytes) -> tuple[str, list[_Element], bytes]:
     return kind, elements, data[end.end() :]
 
 
+def _type(name: str) -> str:
+    if name not in _TYPES:
+        raise ValueError(f"its header has the type {name!r}")
+    return _TYPES[name]
+
+
 # --- rows -------------------------------------------------------------------------------------
+
+
+def _lines(elements: list[_Element], body: bytes) -> list[bytes]:
+    """Rows of all elements, also of a file that has its line ends elsewhere."""
+    lines = text.rows(body)
+    announced = sum(element.count for element in elements if element.properties)
+    if len(lines) == announced:
+        return lines
+    words, found, at = b" ".join(lines).split(), [], 0
+    for element in elements:
+        for _ in range(element.count if element.properties else 0):
+            start = at
+            for _, length in element.properties.values():
+                if at >= len(words):
+                    return lines
+                at += 1 + _size(words[at]) if length else 1
+            found.append(b" ".join(words[start:at]))
+    return found if at == len(words) else lines
+
+
+def _size(word: bytes) -> int:
+    return int(word) if word.isdigit() else 0
 
 
 def _text_rows(element: _Element, rows: Iterator[bytes]) -> _Table:
@@ -196,6 +231,7 @@ def _binary_rows(element: _Element, body: bytes, start: int, order: str) -> tupl
 
 
 _STRUCT = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+_STRUCT |= {"i8": "q", "u8": "Q"}
 
 
 def _same_rows(element: _Element, body: bytes, start: int, order: str) -> tuple[_Table, int] | None:
@@ -239,9 +275,14 @@ def _values(vertex: _Table) -> tuple[dict[str, np.ndarray], list[str]]:
             left_out.append(name)
         elif name not in _NORMALS:
             values[name] = column.astype(column.dtype.newbyteorder("="))
-    shades = [name for name in ("red", "green", "blue", "alpha") if name in values]
-    if len(shades) >= 3 and all(values[name].dtype == np.uint8 for name in shades):
-        values["colors"] = np.column_stack([values.pop(name) for name in shades])
+    for names in _COLORS:
+        shades = [name for name in names if name in values]
+        if shades[:3] == names[:3] and len({values[name].dtype for name in shades}) == 1:
+            colors = colors_of(np.column_stack([values[name] for name in shades]))
+            if colors is not None:
+                values = {name: x for name, x in values.items() if name not in shades}
+                values["colors"] = colors
+                break
     return values, left_out
 
 
@@ -257,7 +298,7 @@ def _faces(
             left_out += [f"{key} of faces" for key in table if len(table[key])]
             continue
         corners = table.pop(next((key for key in _CORNERS if key in lists), lists[0]))
-        if corners.values.dtype.kind == "f":
+        if (corners.values != np.floor(corners.values)).any():
             raise ValueError("its faces are not whole numbers")
         cells, ends = corners.values.astype(np.int64), corners.ends
         if name == "tristrips":  # -1 ends a strip, too

@@ -6,8 +6,10 @@ Nothing stored in a file is ever executed: pickled arrays are refused.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
+import re
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
@@ -17,20 +19,21 @@ from pathlib import Path
 import h5py
 import numpy as np
 import scipy.io
-import trimesh
 
 from dine.errors import DataError
 from dine.geometry.surface import Surface
 from dine.io import announced, text
-from dine.io.brain import read_freesurfer, read_gifti
+from dine.io.brain import AS_TEXT, TRIANGULAR, read_freesurfer, read_gifti
 from dine.io.clouds import read_indices, read_pcd, read_table
 from dine.io.meshes import read_obj, read_off, read_scene, read_stl
 from dine.io.ply import read_ply
 from dine.io.slicer import read_fcsv, read_mrk
 from dine.io.vtk import read_vtk, read_vtp
 
-# Names that trimesh lists as mesh formats but that are serialisations or read here instead.
-_NOT_MESH_FILES = {".stl_ascii", ".xyz", ".json", ".dict", ".dict64", ".msgpack"}
+# Names that trimesh lists as mesh formats but that are serialisations or something else.
+_NOT_MESH_FILES = {".stl_ascii", ".json", ".dict", ".dict64", ".msgpack", ".svg"}
+_PACKED = b"\x1f\x8b"
+_DECIMAL_COMMA = re.compile(r"could not convert string to float: b?'([-+]?\d+,\d+[^']*)'")
 
 
 def read_surface(path: str | os.PathLike) -> Surface:
@@ -53,19 +56,15 @@ def read_surface(path: str | os.PathLike) -> Surface:
     """
     path = Path(path)
     suffix = text.format_suffix(path)
-    read = _READERS.get(suffix)
-    if read is None:
-        raise DataError(
-            f"{path} has the suffix '{path.suffix}', which is not read; convert it to one of "
-            f"{' '.join(READABLE_SUFFIXES)}."
-        )
     try:
+        read = _READERS.get(suffix) or _other_reader(path, suffix)
         data = path.read_bytes()
         if not data:
             raise DataError(f"{path} is empty; expected a mesh or a point cloud, so copy it again.")
-        if path.suffix.lower() == ".gz":
+        if data.startswith(_PACKED):  # whatever its name says: browsers pack and unpack, too
             data = _unpacked(path, data)
-        return read(path, data if suffix in _BINARY else text.without_mark(data))
+        binary = suffix in _BINARY or read is read_freesurfer
+        return read(path, data if binary else text.without_mark(data))
     except DataError:
         raise
     except FileNotFoundError as error:
@@ -76,16 +75,43 @@ def read_surface(path: str | os.PathLike) -> Surface:
         if isinstance(error, OSError) and error.errno is not None:  # no fault of the file's content
             raise DataError(f"{path} is not a readable file ({error.strerror}).") from error
         reason = " ".join(str(error).split()) or type(error).__name__
+        if comma := _DECIMAL_COMMA.search(reason):
+            raise DataError(
+                f"{path} has decimal commas ({comma[1]}); export it again with decimal points."
+            ) from error
         raise DataError(
             f"{path} is damaged, cut short or not a {suffix} file ({reason}); copy it again, or "
             "export it again as plain triangles or points."
         ) from error
 
 
+def _other_reader(path: Path, suffix: str) -> Callable[[Path, bytes], Surface]:
+    """How to read a file whose suffix says nothing.
+
+    Names of FreeSurfer have no suffix but words (lh.pial.T1, rh.sphere.reg), and optional parts of
+    trimesh bring more formats.
+
+    Raises:
+        DataError: it is neither.
+    """
+    with contextlib.suppress(OSError), open(path, "rb") as stream:
+        begin = stream.read(len(AS_TEXT))
+        if begin.startswith(TRIANGULAR):
+            return read_freesurfer
+    import trimesh
+
+    if suffix[1:] in trimesh.exchange.load.mesh_formats() and suffix not in _NOT_MESH_FILES:
+        return read_scene
+    raise DataError(
+        f"{path} has the suffix '{path.suffix}', which is not read; convert it to one of "
+        f"{' '.join(READABLE_SUFFIXES)}."
+    )
+
+
 def _unpacked(path: Path, data: bytes) -> bytes:
-    """What gzip packed, of one member or several."""
+    """What gzip packed, of one member or several; whatever else stands behind is nothing."""
     found, allowed = b"", announced.limit(len(data))
-    while data.strip(b"\0"):
+    while data.startswith(_PACKED):
         unpacker = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
         found += unpacker.decompress(data, allowed + 1 - len(found))
         announced.check(path, "its content", len(found), allowed)
@@ -93,6 +119,18 @@ def _unpacked(path: Path, data: bytes) -> bytes:
             raise ValueError("its compressed content ends too early")
         data = unpacker.unused_data
     return found
+
+
+# --- by content -------------------------------------------------------------------------------
+
+
+def _read_vtk(path: Path, data: bytes) -> Surface:
+    """VTK's data of either form; names of one are given to the other."""
+    return read_vtp(path, data) if data.lstrip()[:1] == b"<" else read_vtk(path, data)
+
+
+def _read_asc(path: Path, data: bytes) -> Surface:
+    return read_freesurfer(path, data) if data.startswith(AS_TEXT) else read_table(path, data)
 
 
 # --- tables and arrays ------------------------------------------------------------------------
@@ -256,19 +294,19 @@ def _face_indices(path: Path, array: np.ndarray) -> np.ndarray:
 
 
 _READERS: dict[str, Callable[[Path, bytes], Surface]] = {
-    f".{name}": read_scene
-    for name in sorted(trimesh.exchange.load.mesh_formats())
-    if f".{name}" not in _NOT_MESH_FILES
-} | {
+    ".glb": read_scene,
+    ".gltf": read_scene,
     ".obj": read_obj,
     ".off": read_off,
     ".ply": read_ply,
     ".stl": read_stl,
-    ".vtp": read_vtp,
-    ".vtk": read_vtk,
+    ".vtp": _read_vtk,
+    ".vtk": _read_vtk,
+    ".vtu": _read_vtk,
     ".gii": read_gifti,
     **dict.fromkeys((".pial", ".white", ".orig", ".smoothwm", ".inflated"), read_freesurfer),
-    **dict.fromkeys((".txt", ".csv", ".tsv", ".asc", ".pts", ".particles"), read_table),
+    **dict.fromkeys((".txt", ".csv", ".tsv", ".pts", ".particles"), read_table),
+    ".asc": _read_asc,
     ".xyz": _read_xyz,
     ".pcd": read_pcd,
     ".fcsv": read_fcsv,
@@ -282,6 +320,6 @@ _READERS: dict[str, Callable[[Path, bytes], Surface]] = {
 _BINARY = {".stl", ".glb", ".npy", ".npz", ".h5", ".mat", ".pial", ".white", ".orig", ".smoothwm"}
 _BINARY |= {".inflated"}
 
-#: Suffixes that ``read_surface`` reads, in lower case with the dot. Which mesh formats are among
-#: them depends on the optional parts of trimesh that are installed.
+#: Suffixes that ``read_surface`` reads, in lower case with the dot. Optional parts of trimesh bring
+#: more.
 READABLE_SUFFIXES: tuple[str, ...] = tuple(_READERS)

@@ -1,4 +1,4 @@
-"""Points that were placed in 3D Slicer: .fcsv of version 4 and .mrk.json of version 5."""
+"""Points that were placed in 3D Slicer: .fcsv of versions 3 to 5 and .mrk.json of version 5."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from dine.errors import DataError
 from dine.geometry.surface import Surface
+from dine.io import text
 from dine.io.clouds import numbers
 
 # Up to version 4.5 of Slicer spaces had numbers.
@@ -27,12 +28,14 @@ def in_space(surface: Surface, space: str | None) -> np.ndarray:
 def read_fcsv(path: Path, data: bytes) -> Surface:
     """Points in the order of the file, in the space that it states."""
     space, names, rows = None, ["id", "x", "y", "z"], []
-    for line in data.decode("utf-8", "replace").splitlines():
+    for line in text.decoded(data).splitlines():
         key, equals, value = line.lstrip("# ").partition("=")
         if not line.startswith("#"):
             rows.append(line)
+        elif key.startswith("Fiducial List file"):  # of version 3, which knows RAS alone
+            space = "RAS"
         elif equals and key.strip() == "CoordinateSystem":
-            space = _SPACES.get(value.strip())
+            space = _SPACES.get(value.strip().upper())
         elif equals and key.strip() == "columns":
             names = [name.strip() for name in value.split(",")]
     fields = [row for row in csv.reader(rows) if any(row)]
@@ -51,8 +54,11 @@ def read_mrk(path: Path, data: bytes) -> Surface:
     Raises:
         DataError: a point has no position yet, or lists are of different spaces.
     """
-    lists = json.loads(data)["markups"]
-    spaces = {_SPACES.get(str(markups.get("coordinateSystem"))) for markups in lists}
+    content = json.loads(data)
+    lists = content.get("markups") if isinstance(content, dict) else None
+    if not isinstance(lists, list):
+        raise ValueError("it has no list of markups")
+    spaces = {_SPACES.get(str(markups.get("coordinateSystem")).upper()) for markups in lists}
     if len(spaces) > 1:
         raise DataError(f"{path} holds lists of different coordinate systems; save one at a time.")
     points = [_position(path, point) for part in lists for point in part.get("controlPoints", ())]
@@ -67,8 +73,11 @@ def _position(path: Path, point: dict[str, Any]) -> list[float]:
         raise DataError(
             f"{path}: the point {point.get('label', '')!r} has no position; place or delete it."
         )
-    x, y, z = map(float, position)
-    return [x, y, z]
+    if isinstance(position, str):
+        position = position.replace(",", " ").split()
+    if not isinstance(position, list) or len(position) != 3:
+        raise ValueError(f"the position of {point.get('label', '')!r} is not of three numbers")
+    return [float(x) for x in position]
 
 
 def _stated(path: Path, space: str | None) -> str:

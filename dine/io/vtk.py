@@ -1,4 +1,4 @@
-"""Reading VTK's PolyData: .vtp (XML) in the encodings of VTK and ParaView, and .vtk (legacy).
+"""Reading VTK's surfaces: .vtp and .vtu (XML) in the encodings of VTK and ParaView, .vtk (legacy).
 
 Read here because VTK itself unpacks to over 500 MB, and meshio and trimesh have no PolyData.
 """
@@ -27,6 +27,9 @@ _LEGACY_TYPES = {"float": "f4", "double": "f8", "vtktypeint64": "i8", "vtkidtype
 _LEGACY_TYPES |= {"char": "i1", "short": "i2", "int": "i4", "long": "i8"}
 _LEGACY_TYPES |= {f"unsigned_{name}": f"u{_LEGACY_TYPES[name][1]}" for name in ("char", "short")}
 _LEGACY_TYPES |= {"unsigned_int": "u4", "unsigned_long": "u8"}
+_LEGACY_CELLS = ((b"POLYGONS", polygons.fans), (b"TRIANGLE_STRIPS", polygons.strips))
+# Kinds of cells of a grid: (poly)vertices, (poly)lines; triangles, polygons, quads; strips.
+_POINTS, _LINES, _POLYGONS, _STRIPS = (1, 2), (3, 4), (5, 7, 9), (6,)
 _UNPACK: dict[str, Callable[[bytes], bytes]] = {
     "vtkZLibDataCompressor": zlib.decompress,
     "vtkLZMADataCompressor": lzma.decompress,
@@ -34,7 +37,7 @@ _UNPACK: dict[str, Callable[[bytes], bytes]] = {
 
 
 def read_vtp(path: Path, data: bytes) -> Surface:
-    """A mesh or cloud of XML PolyData, with its point data.
+    """A mesh or cloud of XML PolyData, or of an UnstructuredGrid of faces, with its point data.
 
     Arrays may be text, base64 or appended, raw or compressed (zlib, LZMA), of either byte order.
     Pieces follow each other; polygons and strips become triangles, lines are left out.
@@ -48,8 +51,9 @@ def read_vtp(path: Path, data: bytes) -> Surface:
     root = ElementTree.fromstring(head + b"</VTKFile>" if mark else head)
     if root.tag != "VTKFile":
         raise ValueError(f"its root is <{root.tag}>, not <VTKFile>")
-    if root.get("type") != "PolyData":
-        raise _other_data(path, str(root.get("type")))
+    kind = str(root.get("type"))
+    if kind not in ("PolyData", "UnstructuredGrid"):
+        raise _other_data(path, kind)
     compressor = root.get("compressor")
     if compressor and compressor not in _UNPACK:
         raise DataError(
@@ -59,19 +63,21 @@ def read_vtp(path: Path, data: bytes) -> Surface:
     decode = _Decoder(root, appended)
     vertices, faces, count = [], [], 0
     values: dict[str, list[np.ndarray]] = {}
-    left_out = dict.fromkeys(_named_arrays(root, "CellData", " of cells"))
-    for piece in root.iterfind("PolyData/Piece"):
+    left_out = dict.fromkeys(_named_arrays(root, f"{kind}/Piece/CellData", " of cells"))
+    for piece in root.iterfind(f"{kind}/Piece"):
         announced = int(piece.get("NumberOfPoints", 0))
         if announced == 0:
             continue
         points = decode(_array(piece, "Points")).reshape(-1, 3)
         if len(points) != announced:
             raise ValueError(f"{len(points)} points where {announced} are announced")
-        for kind, triangles in (("Polys", polygons.fans), ("Strips", polygons.strips)):
-            if int(piece.get(f"NumberOf{kind}", 0)):
-                ends = decode(_array(piece, kind, "offsets")).astype(np.int64)
-                corners = decode(_array(piece, kind, "connectivity")).astype(np.int64)
-                faces.append(_faces(corners, ends, triangles) + count)
+        for part, triangles in (("Polys", polygons.fans), ("Strips", polygons.strips)):
+            if int(piece.get(f"NumberOf{part}", 0)):
+                faces.append(_faces(*_cells(piece, part, decode), triangles, left_out) + count)
+        if int(piece.get("NumberOfCells", 0)):  # of a grid
+            kinds = decode(_array(piece, "Cells", "types"))
+            cells = _cells(piece, "Cells", decode)
+            faces += [x + count for x in _grid_faces(path, *cells, kinds, left_out)]
         left_out |= dict.fromkeys(["lines"] * bool(int(piece.get("NumberOfLines", 0))))
         for name, array in _point_data(piece, decode, announced, left_out):
             values.setdefault(name, []).append(array)
@@ -94,14 +100,58 @@ def _fit(parts: list[np.ndarray]) -> bool:
 
 
 def _faces(
-    corners: np.ndarray, ends: np.ndarray, triangles: Callable[[np.ndarray], np.ndarray]
+    corners: np.ndarray,
+    ends: np.ndarray,
+    triangles: Callable[[np.ndarray], np.ndarray],
+    left_out: dict[str, None],
 ) -> np.ndarray:
     """Triangles (F, 3) of cells given by their corners, and where each ends."""
-    if polygons.small(ends) or (len(ends) and np.diff(ends, prepend=0).min() < 1):
-        raise ValueError("a face has fewer than 3 corners")
+    if len(ends) and np.diff(ends, prepend=0).min() < 0:
+        raise ValueError("a face ends before it begins")
+    if polygons.small(ends):
+        left_out["edges"] = None
     if ends[-1] != len(corners):
         raise ValueError(f"faces of {ends[-1]} corners where there are {len(corners)}")
     return corners[triangles(ends)]
+
+
+def _cells(
+    piece: ElementTree.Element, part: str, decode: _Decoder
+) -> tuple[np.ndarray, np.ndarray]:
+    """Corners one after another, and where each cell ends."""
+    arrays = (decode(_array(piece, part, name)) for name in ("connectivity", "offsets"))
+    corners, ends = (array.astype(np.int64) for array in arrays)
+    return corners, ends
+
+
+def _grid_faces(
+    path: Path,
+    corners: np.ndarray,
+    ends: np.ndarray,
+    kinds: np.ndarray,
+    left_out: dict[str, None],
+) -> list[np.ndarray]:
+    """Triangles of a grid whose cells are faces, as programs save surfaces that know no other.
+
+    Raises:
+        DataError: some are volumes or curved.
+        ValueError: there are more or fewer kinds than cells.
+    """
+    if len(kinds) != len(ends):
+        raise ValueError(f"{len(kinds)} kinds of cells where there are {len(ends)}")
+    if not np.isin(kinds, (*_POINTS, *_LINES, *_POLYGONS, *_STRIPS)).all():
+        raise _other_data(path, "UnstructuredGrid with volumes or curved cells")
+    if np.isin(kinds, _LINES).any():
+        left_out["lines"] = None
+    sizes, faces = np.diff(ends, prepend=0), []
+    if len(sizes) and (sizes.min() < 0 or ends[-1] != len(corners)):
+        raise ValueError("the lengths of its cells do not add up")
+    for some, triangles in ((_POLYGONS, polygons.fans), (_STRIPS, polygons.strips)):
+        chosen = np.isin(kinds, some)
+        if chosen.any():
+            own = corners[np.repeat(chosen, sizes)]
+            faces.append(_faces(own, np.cumsum(sizes[chosen]), triangles, left_out))
+    return faces
 
 
 def _colored(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -113,7 +163,7 @@ def _colored(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _named_arrays(root: ElementTree.Element, part: str, what: str) -> list[str]:
-    return [f"{a.get('Name')}{what}" for a in root.iterfind(f"PolyData/Piece/{part}/DataArray")]
+    return [f"{a.get('Name')}{what}" for a in root.iterfind(f"{part}/DataArray")]
 
 
 def _point_data(
@@ -212,7 +262,7 @@ def _from_base64(text: bytes) -> bytes:
 
 
 def read_vtk(path: Path, data: bytes) -> Surface:
-    """A mesh or cloud of a legacy PolyData file, text or binary, with its point data.
+    """A mesh or cloud of a legacy file, text or binary, with its point data.
 
     Raises:
         DataError: another kind of VTK data.
@@ -225,19 +275,20 @@ def read_vtk(path: Path, data: bytes) -> Surface:
     kind = file.line(rb"DATASET\s+(\w+)")
     if kind is None:
         raise ValueError("it names no data set")
-    if kind[0].upper() != b"POLYDATA":
+    grid = kind[0].upper() == b"UNSTRUCTURED_GRID"
+    if kind[0].upper() != b"POLYDATA" and not grid:
         raise _other_data(path, kind[0].decode("ascii").upper())
     header = file.line(rb"POINTS\s+(\d+)\s+(\w+)")
     if header is None or int(header[0]) == 0:
         raise DataError(f"{path} holds no points; expected PolyData, so export it again.")
     points = file.numbers(3 * int(header[0]), header[1]).reshape(-1, 3).astype(np.float64)
-    after_points, faces, left_out = file.place, [], {}
-    kinds = ((b"POLYGONS", polygons.fans), (b"TRIANGLE_STRIPS", polygons.strips))
-    for name, triangles in kinds:
+    after_points, left_out = file.place, {}
+    faces = file.grid_faces(path, left_out) if grid else []
+    for name, triangles in _LEGACY_CELLS:
         file.place = after_points
         header = file.line(name + rb"\s+(\d+)\s+(\d+)")
         if header is not None and int(header[1]):
-            faces.append(_faces(*file.cells(*map(int, header)), triangles))
+            faces.append(_faces(*file.cells(*map(int, header)), triangles, left_out))
     file.place = after_points
     if file.line(rb"LINES\s+[1-9]\d*\s+(\d+)"):
         left_out["lines"] = None
@@ -298,6 +349,17 @@ class _Legacy:
         if len(ends) != first:
             raise ValueError("the lengths of its cells do not add up")
         return corners, ends
+
+    def grid_faces(self, path: Path, left_out: dict[str, None]) -> list[np.ndarray]:
+        """Triangles of the cells of a grid, all of which must be faces."""
+        header = self.line(rb"CELLS\s+(\d+)\s+(\d+)")
+        if header is None:
+            return []
+        corners, ends = self.cells(*map(int, header))
+        kinds = self.line(rb"CELL_TYPES\s+(\d+)")
+        if kinds is None:
+            raise ValueError("cells without their kinds")
+        return _grid_faces(path, corners, ends, self.numbers(int(kinds[0]), b"int"), left_out)
 
     def data_of(self, count: int, left_out: dict[str, None]) -> Iterator[tuple[str, np.ndarray]]:
         """Arrays of so many points by name, from here on; what is none goes to ``left_out``."""

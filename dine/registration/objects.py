@@ -57,13 +57,13 @@ def _faces(shape: Any, name: str) -> np.ndarray | None:
     found = []
     if isinstance(getattr(shape, "cells_dict", None), Mapping):  # meshio, PyVista's grids
         kinds = {str(kind): array_of(cells) for kind, cells in shape.cells_dict.items()}
-        found = [kinds.pop(kind) for kind in ("triangle", "5") if kind in kinds]
+        found = [_cut(kinds.pop(kind)) for kind in ("triangle", "5", "quad", "9") if kind in kinds]
         if not found and kinds.keys() - {"vertex", "1"}:
             raise DataError(
                 f"{name} has cells of the kinds {', '.join(kinds)} and no triangles; extract its "
                 "surface and triangulate it."
             )
-        return found[0] if found else None
+        return np.concatenate(found) if found else None
     for attribute, cut in (
         ("triangles", polygons.fans),
         ("faces", polygons.fans),
@@ -79,3 +79,9 @@ def _faces(shape: Any, name: str) -> np.ndarray | None:
     if not found and np.size(getattr(shape, "tetras", ())):
         raise DataError(f"{name} holds tetrahedra; extract its surface as triangles.")
     return np.concatenate(found) if found else None
+
+
+def _cut(cells: np.ndarray) -> np.ndarray:
+    """Triangles (F, 3) of cells (C, k), all of k corners."""
+    ends = cells.shape[1] * np.arange(1, len(cells) + 1)
+    return cells.reshape(-1)[polygons.fans(ends)]

@@ -405,12 +405,13 @@ def test_the_space_of_slicer_comes_through(tmp_path, suffix):
 # --- the brain --------------------------------------------------------------------------------
 
 
-def gifti(encoding, order="RowMajorOrder", values=None):
+def gifti(encoding, order="RowMajorOrder", values=None, *, triangles=("INT32", "i4"), rows=False):
     def array(intent, kind, values):
         stored = values if order == "RowMajorOrder" else values.T
         body = stored.tobytes()
         if encoding == "ASCII":
-            text = " ".join(map(str, stored.reshape(-1).tolist()))
+            lines = stored if rows else stored.reshape(1, -1)
+            text = "\n".join(" ".join(map(str, line)) for line in lines.tolist())
         else:
             packed = zlib.compress(body) if encoding.startswith("GZip") else body
             text = base64.b64encode(packed).decode()
@@ -423,7 +424,7 @@ def gifti(encoding, order="RowMajorOrder", values=None):
 
     parts = [
         array("POINTSET", "FLOAT32", V.astype("<f4")),
-        array("TRIANGLE", "INT32", F.astype("<i4")),
+        array("TRIANGLE", triangles[0], F.astype(f"<{triangles[1]}")),
     ]
     if values is not None:
         parts.append(array("SHAPE", "FLOAT32", values.astype("<f4")))

@@ -53,6 +53,8 @@ def test_stand_ins():
     assert_same(strips, [[0, 1, 2], [1, 3, 2]])
     assert_same(SimpleNamespace(points=V, cells_dict={"triangle": F, "line": F[:, :2]}))
     assert_same(SimpleNamespace(points=V, cells_dict={"vertex": F[:, :1]}), None)
+    quads = {"triangle": F[:2], "quad": np.array([[0, 1, 2, 3]])}
+    assert_same(SimpleNamespace(points=V, cells_dict=quads), [*F[:2], [0, 1, 2], [0, 2, 3]])
 
 
 def test_the_packages_themselves():

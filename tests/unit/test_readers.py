@@ -1,5 +1,6 @@
 import io
 import pickle
+import struct
 from pathlib import Path
 
 import h5py
@@ -52,7 +53,7 @@ def ply_text(faces=FACES):
 
 
 def test_every_suffix_is_covered_here():
-    meshes = {".ply", ".obj", ".off", ".stl", ".glb", ".gltf", ".vtp", ".vtk"}
+    meshes = {".ply", ".obj", ".off", ".stl", ".glb", ".gltf", ".vtp", ".vtk", ".vtu"}
     arrays = {".xyz", ".txt", ".csv", ".npy", ".npz", ".h5", ".mat"}
     assert meshes | arrays <= set(READABLE_SUFFIXES)
     assert all(suffix == suffix.lower() and suffix[0] == "." for suffix in READABLE_SUFFIXES)
@@ -204,16 +205,28 @@ STRIP = [[0, 1, 3], [1, 2, 3], [3, 2, 7]]
 
 @pytest.mark.parametrize("name", sorted(p.name for p in SAMPLES.glob("*.vt*")))
 def test_vtk_samples(name):
-    if name.startswith("grid"):
-        with pytest.raises(DataError, match=r"kind UNSTRUCT\w+; .*Extract Surface|kind Unstruct"):
-            read_surface(SAMPLES / name)
-        return
     if name == "raw_lz4.vtp":
         with pytest.raises(DataError, match=r"vtkLZ4DataCompressor.*ZLib or None"):
             read_surface(SAMPLES / name)
         return
     faces = {"strips": STRIP, "cloud": None}.get(name.partition(".")[0], FANS)
-    assert_same(read_surface(SAMPLES / name), GRID, faces)
+    found = read_surface(SAMPLES / name)
+    assert_same(found, GRID, faces)
+    assert ("lines" in found.left_out) == name.startswith("grid")
+
+
+def test_grids_of_volumes_are_refused(tmp_path):
+    content = (SAMPLES / "grid_4.vtk").read_bytes()
+    kinds = struct.pack(">4i", 5, 9, 7, 3)
+    for said, new in (("with volumes or curved cells; .*Extract Surface", (10, 9, 7, 3)), ("", ())):
+        changed = content.replace(kinds, struct.pack(f">{len(new)}i", *new))
+        assert changed != content
+        (tmp_path / "a.vtk").write_bytes(changed)
+        with pytest.raises(DataError, match=said or "damaged, cut short"):
+            read_surface(tmp_path / "a.vtk")
+    for name in ("a.vtp", "a.vtk"):  # whatever it is called
+        (tmp_path / name).write_bytes((SAMPLES / "grid.vtu").read_bytes())
+        assert_same(read_surface(tmp_path / name), GRID, FANS)
 
 
 def test_pieces_of_a_vtp_follow_each_other(tmp_path):

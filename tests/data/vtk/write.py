@@ -66,8 +66,13 @@ def legacy(name, *, binary, version, content=None):
 
 
 def grid():
+    """The same faces, and an edge, as an unstructured grid."""
     found = vtk.vtkUnstructuredGrid()
     found.SetPoints(data([]).GetPoints())
+    cells = [(vtk.VTK_TRIANGLE, (0, 1, 2)), (vtk.VTK_QUAD, (4, 5, 6, 7))]
+    cells += [(vtk.VTK_POLYGON, (0, 1, 6, 7, 3)), (vtk.VTK_LINE, (0, 8))]
+    for kind, corners in cells:
+        found.InsertNextCell(kind, len(corners), corners)
     return found
 
 
@@ -90,11 +95,14 @@ if __name__ == "__main__":
     legacy("binary_5", binary=True, version=51)
     legacy("strips", binary=True, version=51, content=strips)
     legacy("cloud", binary=True, version=51, content=data([]))
-    writer = vtk.vtkUnstructuredGridWriter()
-    writer.SetInputData(grid())
-    writer.SetFileName(str(HERE / "grid.vtk"))
-    writer.Write()
+    for name, version in (("grid_4", 42), ("grid_5", 51)):
+        writer = vtk.vtkUnstructuredGridWriter()
+        writer.SetInputData(grid())
+        writer.SetFileVersion(version)
+        writer.SetFileTypeToBinary()
+        writer.SetFileName(str(HERE / f"{name}.vtk"))
+        writer.Write()
     writer = vtk.vtkXMLUnstructuredGridWriter()
     writer.SetInputData(grid())
-    writer.SetFileName(str(HERE / "grid.vtp"))
+    writer.SetFileName(str(HERE / "grid.vtu"))
     writer.Write()
