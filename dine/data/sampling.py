@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dine.data.assignment import cheapest_assignment
 from dine.errors import ConfigError, DataError
 from dine.geometry.surface import Surface
 
@@ -110,6 +109,8 @@ def sunflower_disc(count: int) -> np.ndarray:
 
 def _transport(points: np.ndarray, template: Callable[[int], np.ndarray]) -> np.ndarray:
     """Entry i: the point that the cheapest one-to-one assignment gives to template point i."""
+    from dine.data.assignment import cheapest_assignment  # compiled: numba takes a while to import
+
     count = len(points)
     return cheapest_assignment(points, template(count), template(count // 8 or 1))
 

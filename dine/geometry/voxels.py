@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
-from scipy.ndimage import label
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from dine.errors import DataError
 from dine.geometry.surface import Surface
+
+if TYPE_CHECKING:
+    import trimesh
 
 # Cells of the finer grid along the edge of a cube, which its share of the inside is counted on.
 _FINER = 4
@@ -124,6 +126,8 @@ def closed_mesh(surface: Surface) -> trimesh.Trimesh:
     Raises:
         DataError: it has no inside.
     """
+    import trimesh  # takes a while, and moving points by voxels needs none of it
+
     if surface.faces is None:
         raise DataError(f"{surface.name} is a cloud of points; expected a closed mesh.")
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=True)
@@ -149,6 +153,9 @@ def voxelised(surface: Surface, edge: float) -> Voxels:
             joins.
         ValueError: an edge that is not positive.
     """
+    import trimesh
+    from scipy.ndimage import label
+
     if not edge > 0:
         raise ValueError(f"the edge of cubes is {edge}; expected a positive length")
     mesh = closed_mesh(surface)

@@ -18,20 +18,17 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import scipy.io
 
 from dine.errors import DataError
 from dine.geometry.surface import Surface
 from dine.io import announced, text
 from dine.io.brain import AS_TEXT, TRIANGULAR, read_freesurfer, read_gifti
 from dine.io.clouds import read_indices, read_pcd, read_table
-from dine.io.meshes import read_obj, read_off, read_scene, read_stl
+from dine.io.meshes import read_obj, read_off, read_stl
 from dine.io.ply import read_ply
 from dine.io.slicer import read_fcsv, read_mrk
 from dine.io.vtk import read_vtk, read_vtp
 
-# Names that trimesh lists as mesh formats but that are serialisations or something else.
-_NOT_MESH_FILES = {".stl_ascii", ".json", ".dict", ".dict64", ".msgpack", ".svg"}
 _PACKED = b"\x1f\x8b"
 _DECIMAL_COMMA = re.compile(r"could not convert string to float: b?'([-+]?\d+,\d+[^']*)'")
 
@@ -98,10 +95,10 @@ def _other_reader(path: Path, suffix: str) -> Callable[[Path, bytes], Surface]:
         begin = stream.read(len(AS_TEXT))
         if begin.startswith(TRIANGULAR):
             return read_freesurfer
-    import trimesh
+    from dine.io import scenes
 
-    if suffix[1:] in trimesh.exchange.load.mesh_formats() and suffix not in _NOT_MESH_FILES:
-        return read_scene
+    if scenes.reads(suffix):
+        return scenes.read_scene
     raise DataError(
         f"{path} has the suffix '{path.suffix}', which is not read; convert it to one of "
         f"{' '.join(READABLE_SUFFIXES)}."
@@ -127,6 +124,12 @@ def _unpacked(path: Path, data: bytes) -> bytes:
 def _read_vtk(path: Path, data: bytes) -> Surface:
     """VTK's data of either form; names of one are given to the other."""
     return read_vtp(path, data) if data.lstrip()[:1] == b"<" else read_vtk(path, data)
+
+
+def _read_scene(path: Path, data: bytes) -> Surface:
+    from dine.io.scenes import read_scene  # trimesh takes a while to import
+
+    return read_scene(path, data)
 
 
 def _read_asc(path: Path, data: bytes) -> Surface:
@@ -175,10 +178,12 @@ def _read_mat(path: Path, data: bytes) -> Surface:
         with announced.hdf5(path) as file:  # MATLAB 7.3, which stores arrays column by column
             arrays = {name: announced.checked(file, name)[()].T for name in _datasets(file)}
     else:
+        from scipy.io import loadmat
+
         content = announced.numeric_variables(path, data)
         arrays = {
             name: value
-            for name, value in scipy.io.loadmat(content).items()
+            for name, value in loadmat(content).items()
             if isinstance(value, np.ndarray) and value.dtype.kind in "fiu"
         }
     if not {"vertices", "points"} & arrays.keys():
@@ -294,8 +299,8 @@ def _face_indices(path: Path, array: np.ndarray) -> np.ndarray:
 
 
 _READERS: dict[str, Callable[[Path, bytes], Surface]] = {
-    ".glb": read_scene,
-    ".gltf": read_scene,
+    ".glb": _read_scene,
+    ".gltf": _read_scene,
     ".obj": read_obj,
     ".off": read_off,
     ".ply": read_ply,

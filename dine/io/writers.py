@@ -17,8 +17,6 @@ from xml.sax.saxutils import quoteattr
 
 import h5py
 import numpy as np
-import scipy.io
-import trimesh
 
 from dine.errors import DataError, StorageError
 from dine.files import atomic_path, check_place
@@ -394,6 +392,8 @@ def _write_stl(path: Path, content: _Content) -> None:
 
 
 def _write_glb(path: Path, content: _Content) -> None:
+    import trimesh  # takes a while
+
     surface = content.surface
     if surface.faces is None:
         shape = trimesh.PointCloud(surface.vertices, colors=content.colors)
@@ -497,7 +497,9 @@ def _write_h5(path: Path, content: _Content) -> None:
 
 
 def _write_mat(path: Path, content: _Content) -> None:
-    scipy.io.savemat(path, content.arrays(), do_compression=True, oned_as="column")
+    from scipy.io import savemat
+
+    savemat(path, content.arrays(), do_compression=True, oned_as="column")
 
 
 def _write_table(path: Path, content: _Content) -> None:

@@ -20,8 +20,6 @@ from torch import Tensor
 from dine.geometry.graph import Graph
 from dine.geometry.neighbours import gather_points, squared_distances
 from dine.models import compiled
-from dine.models.compiled.messages import BeliefPropagation
-from dine.models.compiled.selection import CandidateCost, nearest_candidates
 
 INVALID_COST = 1e6
 """Unary cost of a padded candidate: large enough never to win, small enough to stay finite."""
@@ -57,6 +55,8 @@ def select_candidates(
     count = min(count, target.shape[1])
     clouds = (source, target, source_features, target_features)
     if compiled.supported(*clouds):
+        from dine.models.compiled.selection import CandidateCost, nearest_candidates
+
         index, displacement, cost = nearest_candidates(*clouds, count, target_mask)
         cost = CandidateCost.apply(source_features, target_features, index, cost)
     else:
@@ -152,7 +152,11 @@ def propagate(
     """
     cost = candidates.cost.flatten(0, 1)
     displacement = candidates.displacement.flatten(0, 1).contiguous()
-    propagated = BeliefPropagation.apply if compiled.supported(cost) else propagate_eager
+    propagated = propagate_eager
+    if compiled.supported(cost):
+        from dine.models.compiled.messages import BeliefPropagation
+
+        propagated = BeliefPropagation.apply
     belief = propagated(cost, displacement, graph, smoothness, updates)
     return belief.view(candidates.cost.shape)
 

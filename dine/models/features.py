@@ -6,14 +6,17 @@ None, which is the fast path. Parameter names and shapes are those of the publis
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from dine.geometry.neighbours import Neighbours, gather_points, nearest_neighbours
 from dine.models import compiled
-from dine.models.compiled.convolution import EdgeConvolution, Edges, LinearMaximum
-from dine.models.compiled.rows import NormLeakyReLU
+
+if TYPE_CHECKING:
+    from dine.models.compiled.convolution import Edges
 
 NORM_EPS = 1e-5
 
@@ -27,6 +30,8 @@ def instance_norm(x: Tensor, mask: Tensor | None = None, slope: float = 1.0) -> 
     The variance is the biased one; a slope of 1 is the norm alone.
     """
     if compiled.supported(x):
+        from dine.models.compiled.rows import NormLeakyReLU
+
         return NormLeakyReLU.apply(x, slope, mask, NORM_EPS)
     return instance_norm_eager(x, mask, slope)
 
@@ -43,6 +48,8 @@ def linear_maximum(x: Tensor, weight: Tensor, group: int, mask: Tensor | None = 
     Returns (B, ⌈L / group⌉, C'); a group without valid rows gives zeros.
     """
     if compiled.supported(x, weight):
+        from dine.models.compiled.convolution import LinearMaximum
+
         return LinearMaximum.apply(x, weight, group, mask, NORM_EPS)
     x = F.linear(x, weight)
     surplus = -x.shape[1] % group
@@ -141,6 +148,8 @@ class EdgeConv(nn.Module):
             near, own = F.linear(x, near), F.linear(x, own - near)
         middle, last = (self.conv[i].weight.flatten(1) for i in (3, 6))
         if edges is not None:
+            from dine.models.compiled.convolution import EdgeConvolution
+
             x = EdgeConvolution.apply(near, own, middle, last, edges, self.SLOPE, NORM_EPS)
         else:
             x = edge_convolution(near, own, middle, last, neighbours, self.SLOPE)
@@ -232,7 +241,11 @@ class FeatureNetwork(nn.Module):
             x = x @ self.input_transform(x, mask)
         neighbours = nearest_neighbours(x, x, k, mask, mask)
         reduced = torch.is_autocast_enabled(x.device.type)
-        edges = Edges(neighbours) if compiled.supported(x) and not reduced else None
+        edges = None
+        if compiled.supported(x) and not reduced:
+            from dine.models.compiled.convolution import Edges
+
+            edges = Edges(neighbours)
         for layer in (self.conv1, self.conv2, self.conv3):
             x = layer(x, neighbours, edges)
         return x

@@ -49,7 +49,7 @@ PROGRAM = """if True:
         "scans": run("scans", folder),
         "register": run("register", before, after, "-o", out, "--seed", 1),
     }
-    modules = sorted(sys.modules)
+    modules = sorted(sys.modules)  # of a mesh registered to a mesh, both PLY
     quick = ["--no-surfaces", "--map", 0, "--points", 64, "--overwrite"]
     done |= {
         "view": run("register", before, after, "-o", out, "--view", *quick),
@@ -88,6 +88,14 @@ def test_registering_imports_nothing_of_other_tasks(plain):
     assert not [name for name in ours if name.partition(".")[2].startswith(others)]
     assert "dine.registration.register" in ours
     assert len(ours) <= MOST_MODULES, ours
+    assert not {"networkx", "scipy.io", "trimesh"} & set(modules)
+
+
+def test_what_takes_a_while_is_imported_when_it_is_needed():
+    program = "import sys, dine; dine.register, dine.read_surface; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "torch" in done.stdout.split(), done.stderr
+    assert not {"numba", "scipy.io", "trimesh"} & set(done.stdout.split())
 
 
 @pytest.mark.parametrize(

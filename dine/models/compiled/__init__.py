@@ -5,6 +5,17 @@ shares the blocks out. What a block adds up is added up again in a fixed order, 
 depend on the number of threads.
 """
 
-from dine.models.compiled.parallel import supported
+from __future__ import annotations
 
-__all__ = ["supported"]
+import torch
+from torch import Tensor
+
+
+def supported(*tensors: Tensor) -> bool:
+    """Whether the compiled kernels take these tensors: float32 or float64 on the CPU.
+
+    Their modules are imported by the functions that call them, as numba takes a while to import.
+    """
+    return all(
+        t.device.type == "cpu" and t.dtype in (torch.float32, torch.float64) for t in tensors
+    )

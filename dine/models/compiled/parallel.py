@@ -11,18 +11,10 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from torch import Tensor
 
 # Not the full fast-math set: infinities must keep their meaning, and sums are split by hand.
 _FAST = {"contract", "nsz", "nnan", "arcp", "afn"}
 jit = numba.njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
-
-
-def supported(*tensors: Tensor) -> bool:
-    """Whether the compiled kernels take these tensors: float32 or float64 on the CPU."""
-    return all(
-        t.device.type == "cpu" and t.dtype in (torch.float32, torch.float64) for t in tensors
-    )
 
 
 @cache
