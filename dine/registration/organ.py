@@ -17,7 +17,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, vstack
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -29,16 +29,16 @@ from dine.geometry.distance import distances, landmark_errors, surface_distance
 from dine.geometry.folding import folding
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.oriented import Curve, OrientedPoints, evenly, unit
-from dine.geometry.rigid import Alignment, check_rigid, rigid_alignments
+from dine.geometry.rigid import Alignment, check_rigid, motion_between, rigid_alignments
 from dine.geometry.surface import Surface
 from dine.geometry.voxels import NodeField, Voxels
 from dine.priors.gaussian import CovarianceRoot, LinearGaussian, Posterior, covariance_root
 from dine.priors.organ import OrganPrior
-from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
+from dine.refinement.surface import NO_GUIDES, Outline, SurfaceOptions, refine_on_surface
 from dine.registration.assessment import DOUBTFUL, GOOD, IMPLAUSIBLE
 from dine.registration.shapes import check_sizes, check_spaces, checked_landmarks, dense_points
 from dine.registration.surfaces import oriented_points
-from dine.registration.types import Motion, RegistrationResult, Trust
+from dine.registration.types import Guide, Motion, RegistrationResult, Trust
 
 SOURCE_POINTS = 1500
 TARGET_POINTS = 8000
@@ -150,13 +150,19 @@ class OrganField:
     def bounds(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviation and bound (M,) at points (M, 3) in the template's units; those of the
         nearest vertex where nothing is known inside."""
-        prior = self.placed.prior
-        carrier = prior.inside(points)
-        if carrier is None:
-            nearest = cKDTree(prior.template.vertices).query(points)[1]
-            carrier, points = prior.at_vertices()[nearest], prior.template.vertices[nearest]
+        carrier, points = _known_at(self.placed.prior, points)
         places = self.placed.alignment.normalise(points)
         return deviation_and_bound(self.covariance(carrier, places))
+
+
+def _known_at(prior: OrganPrior, points: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
+    """The carrier to points (M, 3) in the template's units, and these; the nearest vertices where
+    nothing is known inside."""
+    carrier = prior.inside(points)
+    if carrier is not None:
+        return carrier, points
+    nearest = cKDTree(prior.template.vertices).query(points)[1]
+    return prior.at_vertices()[nearest], prior.template.vertices[nearest]
 
 
 def deviation_and_bound(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -182,6 +188,7 @@ class _Search:
         normals: (N, 3) of these.
         scan: in the units of the target.
         partial: it shows a part of the organ only.
+        guide: landmarks to keep to, if any, whose carrier (L, V + n) is ``guided``.
     """
 
     carrier: csr_matrix
@@ -189,6 +196,8 @@ class _Search:
     normals: np.ndarray
     scan: OrientedPoints
     partial: bool
+    guide: Guide | None = None
+    guided: csr_matrix | None = None
 
     @classmethod
     def of(cls, prior: OrganPrior, target: Surface, partial: bool, seed: int) -> _Search:
@@ -204,6 +213,15 @@ class _Search:
         places = samples.places(template.vertices)
         return cls(prior.on_surface(samples), places, normals, scan, partial)
 
+    def keeping_to(self, prior: OrganPrior, guide: Guide | None) -> _Search:
+        """The same with landmarks, which are observed as they are in every round."""
+        if guide is None:
+            return self
+        carrier, places = _known_at(prior, guide.here)
+        # What is known at the nearest vertex is taken to hold there.
+        kept = replace(guide, here=places, there=guide.there + places - guide.here)
+        return replace(self, guide=kept, guided=carrier)
+
     def found(
         self, placed: Placed, options: SurfaceOptions, starts: Sequence[Start] = ()
     ) -> OrganField:
@@ -213,16 +231,21 @@ class _Search:
         inner = np.zeros(len(places), bool)
         moving = OrientedPoints(places, self.normals @ placed.rotation.T, inner)
         fixed = self.scan._replace(points=alignment.frame.normalise(self.scan.points))
+        carrier, guides = self.carrier, NO_GUIDES
+        if self.guide is not None:
+            guides = self.guide.within(alignment)
+            carrier, places = vstack([carrier, self.guided]), np.vstack([places, guides.places])
         root = covariance_root(
             places, prior.widths, prior.amplitudes, rank=_RANK, tolerance=_TOLERANCE
         )
-        mean, modes = placed.at(self.carrier, places)
+        mean, modes = placed.at(carrier, places)
         found = refine_on_surface(
             Outline(moving, _NO_RIM),
             Outline(fixed, _NO_RIM),
             [mean, *(start(places) for start in starts)],
             LinearGaussian(mean, modes, root.root),
             replace(options, source_looks=not self.partial),
+            guides,
         )
         return OrganField(placed, found.posterior, root, found.improbability)
 
@@ -243,6 +266,16 @@ def organ_field(
     beside the prior's mean.
     """
     search = _Search.of(prior, target, partial, seed)
+    return _most_probable(search, prior, matrices, loose, starts), search
+
+
+def _most_probable(
+    search: _Search,
+    prior: OrganPrior,
+    matrices: Sequence[np.ndarray],
+    loose: bool,
+    starts: Sequence[Start] = (),
+) -> OrganField:
     found = []
     for matrix in matrices:
         placed = Placed(prior, Alignment.of(prior.template.vertices, matrix), loose)
@@ -250,7 +283,7 @@ def organ_field(
             for _ in range(_POSES):
                 placed = placed.turned(search.found(placed, _POSE).posterior)
         found.append(search.found(placed, _FIELD, starts))
-    return min(found, key=lambda field: field.improbability), search
+    return min(found, key=lambda field: field.improbability)
 
 
 @dataclass(frozen=True)
@@ -261,11 +294,13 @@ class OrganSettings:
     prealign: str | np.ndarray
     partial: bool
     seed: int
+    guide: Guide | None = None
 
     def described(self) -> dict[str, Any]:
         """For the report."""
         how = self.prealign if isinstance(self.prealign, str) else "given"
-        return {"prealign": how, "partial": self.partial, "seed": self.seed}
+        guides = 0 if self.guide is None else len(self.guide.here)
+        return {"prealign": how, "partial": self.partial, "seed": self.seed, "guides": guides}
 
 
 def register_organ(
@@ -290,9 +325,9 @@ def register_organ(
     check_spaces(source, (target, *apply.values()))
     notes = check_sizes(source, target, settings.partial)
     matrices, loose = _motions(source, target, settings)
-    field, search = organ_field(
-        prior, target, matrices, loose=loose, partial=settings.partial, seed=settings.seed
-    )
+    search = _Search.of(prior, target, settings.partial, settings.seed)
+    search = search.keeping_to(prior, settings.guide)
+    field = _most_probable(search, prior, matrices, loose)
     report = {"settings": settings.described()}
     result = _result(field, search, source, target, report)
     trust = _trust(field, report, notes, float(result.uncertainty.mean()))
@@ -374,6 +409,8 @@ def _motions(
         return [np.eye(4)], False
     if how != "auto":
         raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
+    if settings.guide is not None and settings.guide.tells_rotation:
+        return [motion_between(settings.guide.here, settings.guide.there)], True
     ours, theirs = (dense_points(surface) for surface in (source, target))
     return rigid_alignments(ours, theirs, partial=settings.partial), True
 

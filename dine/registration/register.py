@@ -125,15 +125,11 @@ def register(
         network = {"model": model, "surfaces": not surfaces}
         network |= {"rounds": rounds != ROUNDS, "points": points != POINTS}
         _refuse_network(network)
-        if guide is not None:
-            raise ConfigError(
-                "Landmarks to keep to (--guide) are not taken together with the prior of an organ; "
-                "leave one of both out. --landmarks measures with them."
-            )
-        partial = chosen is Overlap.TARGET_IN_SOURCE
-        return _with_prior(source, target, prior, (prealign, partial, seed), apply or {}, landmarks)
     source, target = as_surface(source, "source"), as_surface(target, "target")
     kept = guide and Guide(*checked_landmarks(guide, source, target), guide_error)
+    if prior is not None:
+        how = (prealign, chosen is Overlap.TARGET_IN_SOURCE, seed, kept)
+        return _with_prior(source, target, prior, how, apply or {}, landmarks)
     device = chosen_device(device)
     settings = Settings(prealign, rounds, chosen, points, seed, device, surfaces, kept)
     return _registered(source, target, model, settings, apply or {}, landmarks)
@@ -149,22 +145,22 @@ def _overlap(name: str, partial: bool) -> Overlap:
 
 
 def _with_prior(
-    source: Shape,
-    target: Shape,
+    source: Surface,
+    target: Surface,
     prior: OrganPrior | str | Path,
-    settings: tuple[str | np.ndarray, bool, int],
+    settings: tuple[str | np.ndarray, bool, int, Guide | None],
     apply: Mapping[str, Shape],
     landmarks: tuple[Points, Points] | None,
 ) -> RegistrationResult:
-    """By the prior of an organ; ``settings`` are alignment, partial and seed."""
+    """By the prior of an organ; ``settings`` are alignment, partial, seed and guiding landmarks."""
     # Nothing else needs these.
     from dine.priors.organ import OrganPrior, load_organ_prior
     from dine.registration.organ import OrganSettings, register_organ
 
     stage("reading, and the organ's field")
     return register_organ(
-        as_surface(source, "source"),
-        as_surface(target, "target"),
+        source,
+        target,
         prior if isinstance(prior, OrganPrior) else load_organ_prior(prior),
         OrganSettings(*settings),
         apply={name: as_surface(shape, name) for name, shape in apply.items()},

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -237,6 +238,46 @@ def test_hidden_places_follow_what_is_seen(prior, known):
     expected = expected if known else placed(expected)
     moved = np.linalg.norm(result.applied["tumour"].vertices - expected, axis=1)
     assert moved.mean() < 0.1 * 60
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_landmarks_on_the_hidden_side_are_kept_to(prior, inside):
+    """Whether something is known inside the organ or at its vertices alone."""
+    if not inside:
+        prior = replace(prior, voxels=None, mean=prior.mean[:642], modes=prior.modes[:, :642])
+    # Of no kind that the prior knows, so that what is seen does not tell it.
+    x, y, z = organ().vertices.T / 40
+    truth = organ().vertices + ways(organ().vertices, [8.0, -5.0, 4.0])
+    truth = truth + np.outer(6 * np.exp(-((z + 0.5) ** 2 + x**2) / 0.1), [0, 0, -1])
+    scan, used = half(truth)
+    hidden = np.setdiff1d(np.arange(len(truth)), used)
+    near = hidden[np.argsort(x[hidden] ** 2 + y[hidden] ** 2)]
+    marks, close = near[:3], near[3:20]
+    settings = {"prior": prior, "partial": True, "prealign": "off"}
+    errors, bounds = [], []
+    for guide in (None, (organ().vertices[marks], truth[marks])):
+        more = {} if guide is None else {"guide": guide, "guide_error": 0.1}
+        result = dine.register(organ(), scan, **settings, **more)
+        errors.append(np.linalg.norm(result.moved.vertices - truth, axis=1))
+        bounds.append(result.bound)
+    without, kept = errors
+    assert kept[marks].max() < 0.5 < without[marks].mean()
+    assert kept[close].mean() < 0.6 * without[close].mean()
+    assert kept[used].mean() < 0.02 * 60
+    assert (bounds[1][marks] < bounds[0][marks]).all()
+    assert result.report["settings"]["guides"] == 3
+
+
+def test_three_landmarks_align_the_template(prior):
+    """Turned so far that the nearest points would lead astray."""
+    turn = trimesh.transformations.rotation_matrix(2.5, [3, 1, 2])[:3, :3]
+    truth = (organ().vertices + ways(organ().vertices, [4.0, -3.0, 2.0])) @ turn.T + 100
+    marks = [0, 100, 300]
+    scan = Surface(truth, organ().faces, "scan")
+    guide = (organ().vertices[marks], truth[marks])
+    result = dine.register(organ(), scan, prior=prior, guide=guide)
+    error = np.linalg.norm(result.moved.vertices - truth, axis=1)
+    assert error.mean() < 1.0
 
 
 def test_what_hardly_moved_narrows_no_bounds(prior):

@@ -251,7 +251,6 @@ def test_landmarks_guide_where_surfaces_leave_it_open():
         ({"guide": (np.zeros((0, 3)), np.zeros((0, 3)))}, "There are no landmarks to keep to"),
         ({"guide_error": 2.0}, "needs such landmarks"),
         ({"overlap": "both", "prior": "none.prior"}, "expected auto or target-in-source"),
-        ({"guide": (np.eye(3), np.eye(3)), "prior": "none.prior"}, "not taken together"),
     ],
 )
 def test_settings_that_exclude_each_other_are_refused(pair, settings, said):
