@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from tqdm import tqdm
@@ -53,12 +54,15 @@ def _line(quiet: bool = False, **settings: Any) -> tqdm:
 class Stages:
     """Stages of one task: a line that changes on a terminal, otherwise a line of the log for each.
 
-    Use as a context manager. While it is open, :func:`stage` and :func:`remark` anywhere below it
-    reach it.
+    With the names of the usual stages, in their ``order``, a bar beside the line says how far this
+    is; it does not go back where stages come again. Use as a context manager. While it is open,
+    :func:`stage` and :func:`remark` anywhere below it reach it.
     """
 
-    def __init__(self):
-        self._shown = _line(bar_format="{desc}")
+    def __init__(self, order: Sequence[str] = ()):
+        form = "{bar:20} {elapsed} {desc}" if order else "{desc}"
+        self._shown = _line(total=len(order) or None, bar_format=form)
+        self._order = order
         self._name, self._began = "", time.monotonic()
 
     def __enter__(self) -> Stages:
@@ -72,6 +76,8 @@ class Stages:
             return
         self._end()
         self._name, self._began = name, time.monotonic()
+        if name in self._order:
+            self._shown.n = max(self._shown.n, self._order.index(name))
         self._say(name)
 
     def remark(self, text: str) -> None:

@@ -141,5 +141,10 @@ def _sentence(error: click.ClickException) -> str:
     """What is wrong with a command line, and where the right one is described."""
     context = getattr(error, "ctx", None)
     message = error.format_message()
+    if isinstance(error, click.NoSuchOption):
+        for option in cli.params:
+            if error.option_name in option.opts:  # of `dine` itself
+                message = f"{error.option_name} stands before the command: dine {option.opts[0]} … "
+                message += f"{context.info_name}."
     end = "" if message.endswith((".", "?", ")")) else "."
     return f"{message}{end} See `{context.command_path if context else 'dine'} --help`."

@@ -178,6 +178,10 @@ grid_options = gathered(
 )
 
 
+# Of most registrations.
+_STAGES = ("reading", "alignment", "network", "points", "surfaces", "measures", "writing")
+
+
 @dataclass(frozen=True)
 class _Writing:
     """What `dine register` is to write, and how it is to tell of that."""
@@ -243,7 +247,7 @@ def register(source, target, further, settings, writing, load_model, grids):
     what `dine apply` needs (OUT.result.npz), a report (OUT.json) and, with --view, a page to look
     at (OUT.html).
     """
-    with Stages() as stages:
+    with Stages(_STAGES) as stages:
         stages.begin("reading")
         start_torch()
         from dine.io.readers import read_surface

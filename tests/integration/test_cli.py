@@ -107,6 +107,14 @@ def test_all_errors_are_one_line_of_one_form(words, code, said, capsys, monkeypa
     assert len(error.splitlines()) == 1
 
 
+def test_options_of_dine_itself_are_said_to_stand_before_the_command(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["dine", "register", "--log", "a.log", "a.ply", "b.ply"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    said = capsys.readouterr().err
+    assert "--log stands before the command: dine --log … register. See" in said
+
+
 def test_details_of_errors_for_who_asks(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr("sys.argv", ["dine", "inspect", str(tmp_path / "none"), "-v"])
     with pytest.raises(SystemExit):

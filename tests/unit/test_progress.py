@@ -64,6 +64,17 @@ def test_stages_are_one_line_that_changes_on_a_terminal(monkeypatch, tmp_path):
     assert len((tmp_path / "log").read_text().splitlines()) == 4
 
 
+def test_a_bar_beside_the_line_says_how_far_it_is(monkeypatch):
+    stream = started(Terminal(), monkeypatch)
+    with Stages(("reading", "network", "writing")) as stages:
+        for name, filled in (("reading", 0), ("network", 6), ("reading", 6), ("writing", 13)):
+            stages.begin(name)
+            shown = stream.getvalue().rpartition("\r")[2]
+            assert f" {name} …" in shown
+            assert max(shown.count("█"), shown.count("#")) == filled
+    assert stream.getvalue().rpartition("\r")[2].strip() == ""
+
+
 def test_quiet_leaves_warnings_and_a_whole_log(monkeypatch, tmp_path):
     stream = started(Terminal(), monkeypatch, tmp_path / "log")
     console.be_quiet()
