@@ -21,7 +21,7 @@ RUN python3 -m venv /opt/venv \
 RUN if [ -n "$STORAGE_PLUGIN" ]; then pip install "$STORAGE_PLUGIN"; fi && pip check
 
 # The repository's package and workflow, as in a checkout: snakemake -s /opt/dine/Snakefile
-COPY pyproject.toml README.md LICENSE Snakefile config.yaml ./
+COPY pyproject.toml setup.py README.md LICENSE Snakefile config.yaml ./
 COPY dine dine
 COPY config config
 COPY profiles profiles

@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 PROFILE = ROOT / "workflow" / "profiles" / "kubernetes" / "config.yaml"
 # What `pip install` and a run need, as in a checkout.
 NEEDED = ("requirements.lock", "requirements-torch.lock", "pyproject.toml", "README.md", "LICENSE")
-NEEDED += ("Snakefile", "config.yaml")
+NEEDED += ("Snakefile", "config.yaml", "setup.py")
 FOLDERS = ("dine", "config", "profiles", "workflow")
 
 
