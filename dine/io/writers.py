@@ -196,6 +196,8 @@ def _left_out(suffix: str, content: _Content) -> list[str]:
         left_out.append("shared vertices")
     if content.colors is not None and suffix not in {*_HOLD_DATA, ".obj", ".glb"}:
         left_out.append("colors")
+    if suffix == ".obj" and content.colors is not None and (content.colors[:, 3:] < 255).any():
+        left_out.append("transparency")
     if surface.texture is not None and suffix not in (".obj", ".ply"):
         left_out.append("texture coordinates")
     if content.statement and suffix not in (".ply", ".obj", ".stl", ".vtk"):

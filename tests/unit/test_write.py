@@ -122,6 +122,9 @@ def test_colors_come_back(tmp_path, suffix, surface):
     found = read_surface(path).data["colors"]
     np.testing.assert_array_equal(found[:, :3], COLORS[:, :3])
     assert found.shape == (6, 3) or (found[:, 3] == 255).all()
+    clear = np.insert(COLORS[:, :3], 3, [255, 255, 255, 255, 255, 7], axis=1)
+    left_out = write_moved(path, surface, colors=clear, overwrite=True)
+    assert left_out == (("transparency",) if suffix == ".obj" else ())
 
 
 KEPT = {
