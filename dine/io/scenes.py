@@ -108,7 +108,14 @@ def _check_gltf(path: Path, data: bytes) -> bool:
                 f"{path} holds compressed or sparse arrays, which are not read; export it without "
                 "compression."
             )
-    parts = (part for mesh in content.get("meshes", ()) for part in mesh.get("primitives", ()))
+    parts = [part for mesh in content.get("meshes", ()) for part in mesh.get("primitives", ())]
+    for part in parts:
+        places = part.get("attributes", {}).get("POSITION")
+        if places is not None and content["accessors"][places].get("normalized"):
+            raise DataError(
+                f"{path} holds coordinates as shares of a box (quantised), which are not read; "
+                "export it without compression."
+            )
     modes = {part.get("mode", 4) for part in parts}
     if 6 in modes:
         raise DataError(

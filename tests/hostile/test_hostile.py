@@ -178,6 +178,13 @@ def test_a_gltf_without_its_coordinates_is_not_read_as_zeros(tmp_path):
     with pytest.raises(DataError, match="compressed or sparse"):
         read_surface(gltf(tmp_path, lambda h: h["accessors"][0].update(sparse={"count": 1})))
 
+    def quantised(header):
+        part = header["meshes"][0]["primitives"][0]
+        header["accessors"][part["attributes"]["POSITION"]]["normalized"] = True
+
+    with pytest.raises(DataError, match="shares of a box"):
+        read_surface(gltf(tmp_path, quantised))
+
 
 def test_a_mesh_placed_without_end(tmp_path, monkeypatch):
     def placed(header):
