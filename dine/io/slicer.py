@@ -35,7 +35,7 @@ def read_fcsv(path: Path, data: bytes) -> Surface:
         elif key.startswith("Fiducial List file"):  # of version 3, which knows RAS alone
             space = "RAS"
         elif equals and key.strip() == "CoordinateSystem":
-            space = _SPACES.get(value.strip().upper())
+            space = _SPACES.get(value.strip(' ,\t"').upper())  # spreadsheets add commas
         elif equals and key.strip() == "columns":
             names = [name.strip() for name in value.split(",")]
     fields = [row for row in csv.reader(rows) if any(row)]

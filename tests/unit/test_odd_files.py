@@ -237,6 +237,16 @@ def test_positions_of_slicer_in_other_forms(tmp_path):
             read(tmp_path / "a.mrk.json", other)
 
 
+def test_landmarks_that_a_spreadsheet_saved(tmp_path):
+    lines = FCSV.format("LPS").splitlines()
+    text = "".join(f"{line}{',' * 8 if line.startswith('#') else ''}\r\n" for line in lines)
+    found = read(tmp_path / "a.fcsv", text)
+    np.testing.assert_array_equal(
+        found.vertices, read(tmp_path / "b.fcsv", "\n".join(lines)).vertices
+    )
+    assert found.space == "LPS"
+
+
 def test_landmarks_of_slicer_3(tmp_path):
     rows = "".join("F,{},{},{},1,1\n".format(*row) for row in V.tolist())
     head = "# Fiducial List file /a.fcsv\n# version = 2\n# columns = label,x,y,z,sel,vis\n"
