@@ -252,6 +252,12 @@ def glbs() -> list[bytes]:
     return [scene.export(file_type="glb"), trimesh.PointCloud(BOX.vertices).export(file_type="glb")]
 
 
+def freesurfer_texts() -> list[bytes]:
+    rows = [*BOX.vertices.tolist(), *BOX.faces.tolist()]
+    text = "".join("{} {} {} 0\n".format(*row) for row in rows)
+    return [f"#!ascii of a box\n{len(BOX.vertices)} {len(BOX.faces)}\n{text}".encode()]
+
+
 def table(delimiter: str, columns: int) -> bytes:
     points = np.tile(BOX.vertices, (1, 2))[:, :columns]
     rows = [delimiter.join(f"{value:.6g}" for value in row) for row in points]
@@ -831,9 +837,11 @@ TARGETS: dict[str, Target] = {
     "off": Target("a.off", exported("off"), m.TEXT, surface),
     "stl": Target("a.stl", exported("stl", "stl_ascii"), m.TEXT, surface),
     "vtp": Target("a.vtp", lambda: [*moved(".vtp")(), *samples(".vtp")], m.TEXT, surface),
+    "vtu": Target("a.vtu", lambda: samples(".vtu"), m.TEXT, surface),
     "vtk": Target("a.vtk", lambda: [*moved(".vtk")(), *samples(".vtk")], m.TEXT, surface),
     "gifti": Target("a.gii", giftis, m.TEXT, surface),
     "freesurfer": Target("lh.pial", freesurfers, m.BYTES, surface),
+    "freesurfer_text": Target("lh.asc", freesurfer_texts, m.TEXT, surface),
     "pcd": Target("a.pcd", pcds, m.TEXT, surface),
     "pts": Target(
         "a.pts", lambda: [b"26\n" + table(" ", 4), b"X;Y;Z\n" + table(";", 3)], m.TEXT, surface
