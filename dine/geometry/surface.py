@@ -72,8 +72,9 @@ class Surface:
         if faces.ndim != 2 or faces.shape[1] != 3:
             raise DataError(f"{self.name}: expected faces of shape (F, 3), found {faces.shape}.")
         if faces.min() < 0 or faces.max() >= len(vertices):
+            wrong = faces.min() if faces.min() < 0 else faces.max()
             raise DataError(
-                f"{self.name}: a face names vertex {int(faces.max())}, but there are only "
+                f"{self.name}: a face names vertex {int(wrong)}, but there are only "
                 f"{len(vertices)} vertices (indices start at 0)."
             )
         object.__setattr__(self, "faces", faces)

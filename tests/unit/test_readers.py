@@ -441,7 +441,7 @@ def test_empty_files_and_garbage(tmp_path, suffix, content, message):
         ("a.npz", npz(vertices=VERTICES, faces=FACES + 0.5), r"not whole numbers .*3\.5"),
         ("a.npz", npz(vertices=VERTICES, faces=FACES * np.nan), "not whole numbers .*nan"),
         ("a.npz", npz(vertices=VERTICES, faces=FACES + 1e300), "not whole numbers"),
-        ("a.npz", npz(vertices=VERTICES, faces=FACES - 1), "a face names vertex"),
+        ("a.npz", npz(vertices=VERTICES, faces=FACES - 1), "a face names vertex -1, but"),
         ("a.npz", npz(vertices=VERTICES, faces=FACES[:, :2]), r"faces of shape \(F, 3\)"),
         ("a.npz", npz(vertices=VERTICES, faces=FACES.astype(str)), "faces of type <U"),
         ("a.blend", b"x", r"suffix '\.blend', which is not read; convert it"),
