@@ -55,7 +55,7 @@ class OrganPrior:
     @property
     def frame(self) -> Frame:
         """In which the template has its middle at the origin and radius 1."""
-        return Frame.of(self.template.vertices)
+        return Frame.of(self.template.vertices[self.template.used])
 
     def check(self, surface: Surface) -> None:
         """Make sure that a mesh is the template.

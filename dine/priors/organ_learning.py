@@ -45,7 +45,7 @@ def learn(
         ConfigError: more components than the fields allow.
     """
     voxels, fields = _joined(template, sets, settings.edge)
-    frame = Frame.of(template.vertices, template.name)
+    frame = Frame.of(template.vertices[template.used], template.name)
     fields = fields / frame.scale
     count = len(fields)
     if count < settings.folds:
@@ -112,7 +112,7 @@ def _joined(
     voxels = next((one.voxels for one in sets if one.voxels is not None), None)
     if voxels is None:
         try:
-            voxels = voxelised(template, edge * Frame.of(template.vertices).scale)
+            voxels = voxelised(template, edge * Frame.of(template.vertices[template.used]).scale)
         except DataError as error:
             log.info("Nothing is known of the inside: %s", error)
     return voxels, np.concatenate([_with_inside(one, voxels) for one in sets])

@@ -103,7 +103,7 @@ class Placed:
         middle = frame.center
         motion[:3, 3] = middle + frame.scale * shift - motion[:3, :3] @ middle
         matrix = motion @ self.alignment.matrix
-        return replace(self, alignment=Alignment.of(self.prior.template.vertices, matrix))
+        return replace(self, alignment=_aligned(self.prior, matrix))
 
 
 @dataclass(frozen=True)
@@ -153,6 +153,11 @@ class OrganField:
         carrier, points = _known_at(self.placed.prior, points)
         places = self.placed.alignment.normalise(points)
         return deviation_and_bound(self.covariance(carrier, places))
+
+
+def _aligned(prior: OrganPrior, matrix: np.ndarray) -> Alignment:
+    """Of the template's own vertices: those that no face uses may lie anywhere."""
+    return Alignment.of(prior.template.vertices[prior.template.used], matrix)
 
 
 def _known_at(prior: OrganPrior, points: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
@@ -278,7 +283,7 @@ def _most_probable(
 ) -> OrganField:
     found = []
     for matrix in matrices:
-        placed = Placed(prior, Alignment.of(prior.template.vertices, matrix), loose)
+        placed = Placed(prior, _aligned(prior, matrix), loose)
         if loose:
             for _ in range(_POSES):
                 placed = placed.turned(search.found(placed, _POSE).posterior)
@@ -330,7 +335,7 @@ def register_organ(
     field = _most_probable(search, prior, matrices, loose)
     report = {"settings": settings.described()}
     result = _result(field, search, source, target, report)
-    trust = _trust(field, report, notes, float(result.uncertainty.mean()))
+    trust = _trust(field, report, notes, float(result.uncertainty[source.used].mean()))
     report["trust"] = {
         "verdict": trust.verdict,
         "reasons": list(trust.reasons),
@@ -376,8 +381,8 @@ def _result(
     report |= _report(field, search, source, target, moved)
     report |= {
         "supported": float(shown.mean()),
-        "uncertainty": _summary(deviation),
-        BOUND_NAME: _summary(bound),
+        "uncertainty": _summary(deviation[source.used]),
+        BOUND_NAME: _summary(bound[source.used]),
     }
     return RegistrationResult(
         source,
@@ -452,7 +457,7 @@ def _report(
             "radius; check that it is this organ, and how it lies (--prealign)."
         )
     places = alignment.normalise(search.places)
-    lengths = np.linalg.norm(moved.vertices - source.vertices, axis=1)
+    lengths = np.linalg.norm(moved.vertices - source.vertices, axis=1)[source.used]
     return {
         "dine": __version__,
         "source": {"name": source.name, "vertices": len(source.vertices)},

@@ -55,7 +55,7 @@ def simulate(
         DataError: a mesh without a clear inside or in several parts, or an inclusion elsewhere.
         ConfigError: patches that fix everything.
     """
-    frame = Frame.of(surface.vertices, surface.name)
+    frame = Frame.of(surface.vertices[surface.used], surface.name)
     source = _normalised(surface, frame)
     organ = Organ.of(source, voxelised(source, settings.edge))
     soft = inclusion and share_inside(organ.voxels, _normalised(inclusion, frame))

@@ -280,6 +280,22 @@ def test_three_landmarks_align_the_template(prior):
     assert error.mean() < 1.0
 
 
+def test_vertices_that_no_face_uses_make_no_difference(prior):
+    """As crops leave them, far away; of a prior, too."""
+    scan, _ = half(organ().vertices + ways(organ().vertices, [8.0, -5.0, 4.0]))
+    expected = dine.register(organ(), scan, prior=prior, partial=True, prealign="off")
+    stray = Surface(np.vstack([organ().vertices, [[1e6, 0, 0]]]), organ().faces, "organ")
+    fields = np.pad(family(30, 0).astype(np.float32), ((0, 0), (0, 1), (0, 0)))
+    other = learn(stray, [OrganDeformations(stray, fields)], SETTINGS)
+    found = dine.register(stray, scan, prior=other, partial=True, prealign="off")
+    places = expected.moved.vertices
+    np.testing.assert_allclose(found.moved.vertices[:-1], places, atol=0.01 * 60)
+    np.testing.assert_allclose(found.bound[:-1], expected.bound, rtol=0.1)
+    for name in ("displacement", "uncertainty", "bound_90"):
+        ours, theirs = found.report[name]["max"], expected.report[name]["max"]
+        assert ours == pytest.approx(theirs, rel=0.1)
+
+
 def test_what_hardly_moved_narrows_no_bounds(prior):
     """A scan of the side that is held says little of how far the rest went."""
     scan, _ = half(organ().vertices)

@@ -186,6 +186,12 @@ def test_units_and_place_make_no_difference(fields):
     assert np.allclose(found.vertices / 25.4, fields.vertices[:2], atol=1e-3)
 
 
+def test_vertices_that_no_face_uses_make_no_difference(fields):
+    stray = Surface(np.vstack([ball().vertices, [[1e4, 0, 0]]]), ball().faces, "ball")
+    found = simulate(stray, FEW.model_copy(update={"fields": 2}), seed=3)
+    np.testing.assert_allclose(found.vertices[:, :-1], fields.vertices[:2], atol=1e-3)
+
+
 def test_fixed_vertices_stay(fields):
     fixed = ball().vertices[:, 2] < -0.5
     found = simulate(ball(), FEW, seed=3, fixed=fixed)
