@@ -27,8 +27,9 @@ ROUNDING = 1e-5
 def forks():
     """Processes start as forks of one that has imported all that they need, which takes most of the
     time else. Those of a command, in test_stages.py, start as they do for users."""
-    preloaded = ("dine.training.stages", "lightning_fabric", "pytest", "torch._dynamo", "zuko")
-    multiprocessing.get_context("forkserver").set_forkserver_preload(list(preloaded))
+    kernels = [f"dine.models.compiled.{name}" for name in ("convolution", "messages", "selection")]
+    preloaded = ["dine.training.stages", "lightning_fabric", "pytest", "torch._dynamo", "zuko"]
+    multiprocessing.get_context("forkserver").set_forkserver_preload([*preloaded, *kernels])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(parallel, "START", "forkserver")
         yield
