@@ -161,7 +161,10 @@ def _field(arrays: dict[str, np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
         return FittedDisplacement(arrays["points"], arrays["displacement"])
     if "nodes" in arrays:
         return _node_field(**arrays)
-    kernel = (arrays["widths"].tolist(), arrays["deviations"].tolist(), float(arrays["affine"]))
+    widths, deviations = arrays["widths"], arrays["deviations"]
+    if widths.ndim != 1 or widths.shape != deviations.shape or not (widths > 0).all():
+        raise ValueError("the process of its field has other widths than deviations")
+    kernel = (widths.tolist(), deviations.tolist(), float(arrays["affine"]))
     pivots, lower, amplitudes = (arrays[name] for name in ("pivots", "lower", "amplitudes"))
     rank = len(pivots)
     if (pivots.shape, lower.shape, amplitudes.shape) != ((rank, 3), (rank, rank), (rank, 3)):

@@ -108,6 +108,9 @@ def test_results_that_cannot_be_loaded(result, tmp_path):
     whole = file.read_bytes()
     with np.load(file) as stored:
         arrays = dict(stored)
+    widths = arrays.get("field.widths")  # of a process alone
+    wrong = [] if widths is None else [widths[1:], 0 * widths, widths[None]]
+    process = [({"field.widths": x}, "other widths than deviations") for x in wrong]
     for content, said in (
         (whole[:-30], "damaged, cut short or no result"),
         (b"", "damaged, cut short or no result"),
@@ -117,6 +120,7 @@ def test_results_that_cannot_be_loaded(result, tmp_path):
         ({"moved": arrays["moved"] * np.nan}, "NaN or infinite"),
         ({"scale": np.array(0.0)}, "its frame is damaged"),
         ({"alignment": 2 * np.eye(4)}, "not a rotation and a translation"),
+        *process,
     ):
         if isinstance(content, bytes):
             file.write_bytes(content)
