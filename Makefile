@@ -5,8 +5,6 @@ PYTHON ?= python3
 JOBS ?= 2
 INPUTS ?= 12000
 SEED ?= 0
-MESHES ?= dine/scans
-ORGANS ?= before.ply
 BIN := .venv/bin
 
 .PHONY: install run tiny organ test test-cpus kill-test fuzz test-oldest check format docs wheel-check slurm-test profiles-check audit lock
@@ -19,10 +17,10 @@ run: .venv/installed
 tiny: .venv/installed
 	$(BIN)/snakemake -j$(JOBS) all evidence --configfile config/tiny.yaml
 
-# The tables of docs/guide/organ.md, some three minutes an organ; by default of the shipped synthetic
-# one. Of others: make organ MESHES=folder ORGANS="a.ply b.ply"
+# What a prior of one organ is worth, by default of the shipped synthetic scan. Of other meshes:
+# make organ CONFIG=my.yaml, with names and files under `organ.templates`.
 organ: .venv/installed
-	$(BIN)/python benchmarks/organ.py $(MESHES) --only $(ORGANS)
+	$(BIN)/snakemake -j$(JOBS) organ $(if $(CONFIG),--configfile $(CONFIG))
 
 # Two workers, on a core each, and whole files for each: what the tests of one share is made once.
 PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder

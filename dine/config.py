@@ -398,6 +398,45 @@ class OrganLearning(Section):
         return self
 
 
+TrialMethod = Literal[
+    "unregistered", "rigid", "bcpd", "smooth", "pca", "pca_process", "one_patch", "places_given"
+]
+TrialQuestion = Literal["methods", "seen", "mechanics", "size"]
+
+
+class OrganTrial(Section):
+    """What a prior of one organ is worth: `snakemake -j2 organ` (docs/guide/organ.md)."""
+
+    templates: dict[str, str] = {}
+    """Closed meshes by names; by default the shipped synthetic scan."""
+    deformations: Annotated[Count, Field(ge=2)] = 8
+    """True deformations under each condition, by other mechanics than the simulations."""
+    questions: list[TrialQuestion] = Field(
+        default=["methods", "seen", "mechanics", "size"], min_length=1
+    )
+    """What is changed: nothing; share seen, noise and pose; what simulations are wrong about;
+    amplitude."""
+    compared: list[TrialMethod] = Field(
+        default=["rigid", "bcpd", "smooth", "pca", "pca_process", "places_given"], min_length=1
+    )
+    """Methods under the conditions of a change; where nothing is changed, all there are."""
+    edge: Positive = 0.125
+    """Edge of the cubes of these, in radii; that of the simulations should be another."""
+    simulation: Simulation = Simulation()
+    """Of the deformations that priors are learned of."""
+    learning: OrganLearning = OrganLearning()
+
+    @model_validator(mode="after")
+    def _named(self):
+        for name in self.templates:
+            if not _NAME.match(name):
+                raise ValueError(
+                    f"`templates.{name}` must have a name of lower-case letters, digits and "
+                    "underscores, starting with a letter"
+                )
+        return self
+
+
 class Training(Section):
     """What every training shares."""
 
@@ -675,6 +714,7 @@ class Config(Compute):
     evaluation: Evaluation = Evaluation()
     pretraining: Pretraining = Pretraining()
     evidence: Evidence = Evidence()
+    organ: OrganTrial = OrganTrial()
 
     @model_validator(mode="after")
     def _references(self):

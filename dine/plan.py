@@ -7,9 +7,11 @@ made again when that changes, and only then. Cheap to import: Snakemake does it 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -264,6 +266,56 @@ class Plan:
         for run in runs(self.config):
             network = self.files.run(*run)
             found += [network.model, network.calibration]
+        return found
+
+    # --- the trial of a prior of one organ
+
+    @cached_property
+    def organ_templates(self) -> dict[str, str]:
+        """Meshes by names; the shipped scan, if none are given."""
+        given = self.config.organ.templates
+        shipped = resources.files("dine") / "scans" / "before.ply"
+        return {name: str(Path(path).expanduser()) for name, path in given.items()} or {
+            "scan": str(shipped)
+        }
+
+    def organ_signature(self, template: str) -> str:
+        """Changes when a user's own mesh does, by its size and time."""
+        try:
+            found = os.stat(self.organ_templates[template]) if self.config.organ.templates else None
+        except OSError:
+            return ""  # the job says that it is missing
+        return f"{found.st_size} {found.st_mtime_ns}" if found else ""
+
+    @property
+    def organ_truth(self) -> str:
+        organ = self.config.organ
+        return text({"deformations": organ.deformations, "edge": organ.edge})
+
+    def organ_simulation(self, how: str) -> str:
+        """Held at given vertices exactly, or about them."""
+        held = "about" if how == "about" else "exactly"
+        return section(self.config.organ.simulation.model_copy(update={"fixed": held}))
+
+    def organ_trial(self, about: str) -> str:
+        """Where nothing is changed, all methods are shown, and nothing is simulated anew."""
+        organ = self.config.organ
+        given = {"simulation": organ.simulation.model_dump(), "compared": organ.compared}
+        return text({} if about == "methods" else given)
+
+    @property
+    def organ_measured(self) -> list[tuple[str, str]]:
+        """Every (template, question)."""
+        asked = self.config.organ.questions
+        return [(name, about) for name in self.organ_templates for about in asked]
+
+    def organ_kept(self) -> list[Path]:
+        found = []
+        for template in self.organ_templates:
+            files = self.files.trial(template)
+            found += [files.template, files.truth]
+            for how in ("about", "patch"):
+                found += [files.held(how), files.fields(how), files.prior(how)]
         return found
 
 

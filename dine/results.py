@@ -149,6 +149,15 @@ class Results:
     def pretraining_fields(self, backbone: str, shape: str) -> Path:
         return self.root / "pretraining" / backbone / f"fields_{shape}.h5"
 
+    def trial(self, template: str) -> TrialFiles:
+        """Of the trial of a prior of one organ."""
+        return TrialFiles(self.root / "organ_trial" / template)
+
+    @property
+    def trial_tables(self) -> Path:
+        """All tables of these trials together; each of them lies beside it."""
+        return self._below("organ_trial", "tables", "all", suffix=".md")
+
     @property
     def evidence(self) -> EvidenceFiles:
         return EvidenceFiles(self.root / "evidence")
@@ -181,6 +190,32 @@ class EvidenceFiles:
 
     def examples(self, dataset: str, suffix: str = "png") -> Path:
         return self.folder / dataset / f"examples.{suffix}"
+
+
+@dataclass(frozen=True)
+class TrialFiles:
+    """Files of the trial of a prior of one organ."""
+
+    folder: Path
+
+    template = _named("template.ply")
+    """The mesh in radii, around the origin."""
+    truth = _named("truth.h5")
+    """Deformations by other mechanics."""
+
+    def held(self, how: str) -> Path:
+        """Numbers of the vertices that simulations are held at, or about."""
+        return self.folder / f"held_{how}.txt"
+
+    def fields(self, how: str) -> Path:
+        return self.folder / f"fields_{how}.h5"
+
+    def prior(self, how: str) -> Path:
+        return self.folder / f"prior_{how}.h5"
+
+    def measured(self, about: str) -> Path:
+        """Errors under the conditions of a question."""
+        return self.folder / f"{about}.csv"
 
 
 def conditions(config: Config, dataset: str) -> list[tuple[str, float]]:

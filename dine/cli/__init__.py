@@ -23,7 +23,10 @@ from dine.extras import extras_needed
 # In the order of the help: the module that its commands are in, and their names.
 GROUPS = {
     "Register scans": ("registration", "register apply register-many scans calibrate"),
-    "A prior of one organ": ("organ", "simulate learn"),
+    "A prior of one organ": (
+        "organ",
+        "simulate learn organ-template organ-truth organ-trial organ-tables",
+    ),
     "Pairs to train and test on": ("data", "inspect raw pairs corrupt resample agreement"),
     "Networks and priors": ("training", "stage1 pretrain fields fit-prior search-lambda stage2"),
     "Predictions and metrics": ("evaluation", "predict evaluate refine-predictions classical"),

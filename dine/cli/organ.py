@@ -10,9 +10,17 @@ import click
 
 from dine import __version__, config
 from dine.cli.console import tell
-from dine.cli.options import IN, gathered, own_out_option, seed_option, settings_option
+from dine.cli.options import (
+    IN,
+    OUT_FOLDER,
+    gathered,
+    out_option,
+    own_out_option,
+    seed_option,
+    settings_option,
+)
 from dine.errors import ConfigError
-from dine.files import digest
+from dine.files import digest, write_text
 from dine.provenance import code_digest
 
 if TYPE_CHECKING:
@@ -145,3 +153,104 @@ def learn(template, fields, out, settings, seed):
     radii = ", ".join(f"{x:.3f}" for x in prior.amplitudes)
     found = f"{len(prior.modes)} components of {prior.facts['fields']} fields"
     tell([f"{out}: {found}, and a process of {radii} radii"])
+
+
+@click.command()
+@click.argument("mesh", type=IN)
+@out_option("Folder to write to.", OUT_FOLDER)
+def organ_template(mesh, out):
+    """Write MESH in radii, and the vertices that simulations of a trial are held at, or about.
+
+    Example: dine organ-template liver.ply --out trial
+    """
+    from dine.geometry.frame import Frame
+    from dine.geometry.surface import Surface
+    from dine.geometry.voxels import closed_mesh
+    from dine.io.readers import read_surface
+    from dine.io.writers import write_surface
+    from dine.results import TrialFiles
+    from dine.trials.mechanics import held, patch
+
+    found = read_surface(mesh)
+    closed_mesh(found)  # nothing is written of another
+    vertices = Frame.of(found.vertices, found.name).normalise(found.vertices)
+    files = TrialFiles(out)
+    write_surface(files.template, Surface(vertices, found.faces, found.name))
+    for how, where in (("about", held), ("patch", patch)):
+        numbers = where(Surface(vertices, found.faces)).nonzero()[0].tolist()
+        write_text(files.held(how), "".join(f"{number}\n" for number in numbers))
+
+
+@click.command()
+@click.argument("template", type=IN)
+@settings_option(config.OrganTrial)
+@seed_option
+@out_option("Deformations to write (HDF5).")
+def organ_truth(template, settings, seed, out):
+    """Deform TEMPLATE of `dine organ-template` by other mechanics than those of `dine simulate`.
+
+    Example: dine organ-truth trial/template.ply --out trial/truth.h5
+    """
+    from dine.io.readers import read_surface
+    from dine.simulation.fields import write_deformations
+    from dine.trials.mechanics import true_deformations
+
+    surface = read_surface(template)
+    found = true_deformations(surface, settings.deformations, seed, edge=settings.edge)
+    write_deformations(out, found, {"seed": seed, "version": __version__})
+
+
+@click.command()
+@gathered(
+    "files",
+    dict,
+    click.option("--truth", type=IN, required=True, help="Of `dine organ-truth`."),
+    click.option("--held", type=IN, required=True, help="Of `dine organ-template`, held_about."),
+    click.option("--prior", type=IN, required=True, help="Of `dine learn`, of the mesh in radii."),
+    click.option("--one-patch", type=IN, help="The same of simulations held at one patch."),
+)
+@click.option(
+    "--about",
+    type=click.Choice(config.OrganTrial.model_fields["questions"].default),
+    default="methods",
+    help="What is changed: nothing, what is seen, what simulations are wrong about, amplitude.",
+)
+@settings_option(config.OrganTrial)
+@out_option("Errors to write (CSV).")
+def organ_trial(files, about, settings, out):
+    """Register partial scans of known deformations with a prior of the organ, and without.
+
+    Example: dine organ-trial --truth trial/truth.h5 --held trial/held_about.txt --prior organ.prior
+    --out trial/methods.csv
+    """
+    from dine.priors.organ import load_organ_prior
+    from dine.reporting.table import write_numbers
+    from dine.simulation.fields import read_deformations, read_vertex_numbers
+    from dine.trials.organ import Methods, trial
+
+    truth, prior = read_deformations(files["truth"]), load_organ_prior(files["prior"])
+    prior.check(truth.template)
+    methods = Methods(prior, files["one_patch"] and load_organ_prior(files["one_patch"]))
+    held = read_vertex_numbers(files["held"], len(truth.template.vertices))
+    write_numbers(trial(about, methods, truth, held, settings), out)
+
+
+@click.command()
+@click.option(
+    "--measured",
+    type=(str, IN),
+    multiple=True,
+    required=True,
+    metavar="TEMPLATE CSV",
+    help="Of `dine organ-trial`, and of which template; repeatable.",
+)
+@out_option("Folder for CSV, Markdown and LaTeX.", OUT_FOLDER)
+def organ_tables(measured, out):
+    """Write tables of what `dine organ-trial` measured.
+
+    Example: dine organ-tables --measured liver trial/methods.csv --out trial/tables
+    """
+    from dine.reporting.organ import load_trials, trial_tables
+    from dine.reporting.table import write_tables
+
+    write_tables(trial_tables(load_trials(measured)), out)

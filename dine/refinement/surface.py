@@ -389,7 +389,9 @@ class _Search:
         options = self.options
         moved = self.source.points + field
         count = len(moved)
-        index, matched, ours = self._matches(moved, options.turning * deviation)
+        index, matched, ours = self._matches(
+            moved, options.turning * deviation, options.source_looks
+        )
         offset, normal, squared, agreeing = self._apart(moved, index, matched, ours)
         squared /= (options.reach * deviation) ** 2
         agreeing[:count] &= options.source_looks
@@ -474,18 +476,22 @@ class _Search:
         return beyond
 
     def _matches(
-        self, moved: np.ndarray, turning: float
+        self, moved: np.ndarray, turning: float, source_asks: bool = True
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Indices of source and target points that are nearest, first those that the source asks
-        for; and the normals (n, 3) of the source's, on the target's side."""
+        for, or any if it does not; and the normals (n, 3) of the source's, on the target's
+        side."""
         normals = self.normals(moved)
         there = np.hstack([self.target.points, turning * self.target.normals])
-        tree, asking = _tree(there), there[self.asking]
+        asking, count = there[self.asking], len(moved)
+        tree = _tree(there) if source_asks else None
+        nothing = np.zeros(count), np.zeros(count, int)
         ways = []
         for sign in self.signs:
             here = np.hstack([moved, sign * turning * normals])
-            (away, to), (back, asked) = tree.query(here), _tree(here).query(asking)
-            index = np.concatenate([np.arange(len(moved)), asked])
+            away, to = tree.query(here) if tree else nothing
+            back, asked = _tree(here).query(asking)
+            index = np.concatenate([np.arange(count), asked])
             matched = np.concatenate([to, self.asking])
             ways.append((np.concatenate([away, back]), index, matched, sign * normals[index]))
         if len(ways) == 1:

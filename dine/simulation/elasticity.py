@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 from functools import cache
 
+import numba
 import numpy as np
 from scipy.sparse import csc_matrix, csr_matrix, eye_array, kron
 from scipy.sparse.linalg import SuperLU, splu
@@ -40,6 +41,7 @@ _ENOUGH, _LOST = 1e-3, 3.0
 _TURNS = 12
 _FLAT = 1e-6
 _TINY = np.finfo(float).tiny
+_jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @cache
@@ -149,7 +151,8 @@ class SoftBody:
         """Change (f, 3, B) of the free nodes that forces (n, 3, B) ask for, with the rotations
         (3, 3, E, B) of the cubes."""
         node = self._around(turn)[:, :, self._free]
-        return _turned(node, self._solved(_turned(node.swapaxes(0, 1), forces[self._free])))
+        asked = _turned_back(node, forces[self._free][:, None])[:, 0]
+        return _turned(node, self._solved(asked)[:, None])[:, 0]
 
     def _resistance(
         self, displacement: np.ndarray, growth: np.ndarray
@@ -159,17 +162,16 @@ class SoftBody:
         corner = displacement[self._cubes]
         gradient = np.tensordot(corner, _MIDDLE, axes=(1, 0)).transpose(1, 3, 0, 2)
         turn = rotations(gradient + np.eye(3)[:, :, None, None])
-        each = turn[:, :, :, None]
-        strain = _turned(each.swapaxes(0, 1), corner + _REST)
+        strain = _turned_back(turn, corner + _REST)
         strain -= _REST * (1 + growth[:, None, None])
-        return self._forces(strain, each), turn
+        return self._forces(strain, turn), turn
 
-    def _forces(self, strain: np.ndarray, each: np.ndarray) -> np.ndarray:
+    def _forces(self, strain: np.ndarray, turn: np.ndarray) -> np.ndarray:
         """(n, 3, B) of the corners' displacements (E, 8, 3, B) in the frames of the cubes."""
         cubes, _, _, batch = strain.shape
         force = np.matmul(self._matrix, strain.reshape(cubes, 24, batch)).reshape(strain.shape)
         force *= self._stiffness[:, None, None, None]
-        total = self._sum @ _turned(each, force).reshape(8 * cubes, -1)
+        total = self._sum @ _turned(turn, force).reshape(8 * cubes, -1)
         return total.reshape(-1, 3, batch)
 
     def _around(self, turn: np.ndarray) -> np.ndarray:
@@ -241,10 +243,38 @@ def _factorised(matrix: csc_matrix) -> SuperLU:
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0, options=options)
 
 
+@_jit
 def _turned(turn: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Rotations (3, 3, ..., B) of vectors (..., 3, B)."""
-    x, y, z = (vectors[..., axis, :] for axis in range(3))
-    return np.stack([row[0] * x + row[1] * y + row[2] * z for row in turn], axis=-2)
+    """By rotations (3, 3, E, B) the vectors (E, K, 3, B)."""
+    found = np.empty_like(vectors)
+    cubes, corners, _, batch = vectors.shape
+    for e in range(cubes):
+        for k in range(corners):
+            for i in range(3):
+                for b in range(batch):
+                    found[e, k, i, b] = (
+                        turn[i, 0, e, b] * vectors[e, k, 0, b]
+                        + turn[i, 1, e, b] * vectors[e, k, 1, b]
+                        + turn[i, 2, e, b] * vectors[e, k, 2, b]
+                    )
+    return found
+
+
+@_jit
+def _turned_back(turn: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """By the inverses of rotations (3, 3, E, B) the vectors (E, K, 3, B)."""
+    found = np.empty_like(vectors)
+    cubes, corners, _, batch = vectors.shape
+    for e in range(cubes):
+        for k in range(corners):
+            for i in range(3):
+                for b in range(batch):
+                    found[e, k, i, b] = (
+                        turn[0, i, e, b] * vectors[e, k, 0, b]
+                        + turn[1, i, e, b] * vectors[e, k, 1, b]
+                        + turn[2, i, e, b] * vectors[e, k, 2, b]
+                    )
+    return found
 
 
 def _cofactors(matrix: np.ndarray) -> np.ndarray:
@@ -270,13 +300,32 @@ def rotations(matrices: np.ndarray) -> np.ndarray:
         left, _, right = np.linalg.svd(np.moveaxis(turn[:, :, inverted], 2, 0))
         left[np.linalg.det(left @ right) < 0, :, 2] *= -1
         turn[:, :, inverted] = np.moveaxis(left @ right, 0, 2)
-    for _ in range(_TURNS):
-        inverse = _cofactors(turn)
-        inverse /= (turn[0] * inverse[0]).sum(axis=0)
-        inverse += turn
-        inverse *= 0.5
-        change = np.abs(inverse - turn).max()
-        turn = inverse
-        if change < _FLAT:
-            break
-    return turn
+    flat = np.ascontiguousarray(turn).reshape(9, -1)
+    _orthogonalise(flat)
+    return flat.reshape(turn.shape)
+
+
+@_jit
+def _orthogonalise(matrices: np.ndarray) -> None:
+    """Newton's iteration for the orthogonal factors of matrices (9, n), in place."""
+    for i in range(matrices.shape[1]):
+        a, b, c = matrices[0, i], matrices[1, i], matrices[2, i]
+        d, e, f = matrices[3, i], matrices[4, i], matrices[5, i]
+        g, h, k = matrices[6, i], matrices[7, i], matrices[8, i]
+        for _ in range(_TURNS):
+            # The inverse's transpose: cofactors over the determinant.
+            p, q, r = e * k - f * h, f * g - d * k, d * h - e * g
+            half = 0.5 / (a * p + b * q + c * r)
+            s, t, u = c * h - b * k, a * k - c * g, b * g - a * h
+            v, w, x = b * f - c * e, c * d - a * f, a * e - b * d
+            change = abs(half * p - 0.5 * a) + abs(half * t - 0.5 * e) + abs(half * x - 0.5 * k)
+            change += abs(half * q - 0.5 * b) + abs(half * r - 0.5 * c) + abs(half * s - 0.5 * d)
+            change += abs(half * u - 0.5 * f) + abs(half * v - 0.5 * g) + abs(half * w - 0.5 * h)
+            a, b, c = 0.5 * a + half * p, 0.5 * b + half * q, 0.5 * c + half * r
+            d, e, f = 0.5 * d + half * s, 0.5 * e + half * t, 0.5 * f + half * u
+            g, h, k = 0.5 * g + half * v, 0.5 * h + half * w, 0.5 * k + half * x
+            if change < _FLAT:
+                break
+        matrices[0, i], matrices[1, i], matrices[2, i] = a, b, c
+        matrices[3, i], matrices[4, i], matrices[5, i] = d, e, f
+        matrices[6, i], matrices[7, i], matrices[8, i] = g, h, k

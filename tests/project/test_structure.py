@@ -26,6 +26,7 @@ FLOORS = [
     ("evaluation",),
     ("viewer",),
     ("classical", "registration"),
+    ("trials",),
     ("reporting",),
     ("cli",),
 ]

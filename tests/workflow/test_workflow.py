@@ -353,7 +353,7 @@ def test_a_list_of_pairs_is_a_test_set(tmp_path):
     assert planned(folder, made / "pairs.h5", *arguments)["evidence_raw"] == 1
 
 
-@pytest.mark.parametrize("target", ["all", "evidence", "pretrained", "calibrations"])
+@pytest.mark.parametrize("target", ["all", "evidence", "pretrained", "calibrations", "organ"])
 def test_a_target_names_what_it_makes_on_its_way(tmp_path, target):
     """Snakemake makes a deleted file again only where the target itself, or a job to run, asks."""
     folder = copy_workflow(tmp_path)

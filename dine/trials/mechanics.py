@@ -1,19 +1,22 @@
 """Deformations that a prior of simulations was not learned from: other mechanics, fixation, loads.
 
 Compressible neo-Hookean bodies at finite strain, total Lagrangian, by Newton's method with a direct
-solver and rising loads; nothing of ``dine.simulation`` but the cubes. What holds the organ is a
-slab at one of its ends, what moves it traction on a round or long patch, which turns with nothing,
-and its weight; Poisson ratios are lower and the grid is another one.
+solver and rising loads; nothing of :mod:`dine.simulation` but the cubes. What holds the organ is a
+patch near one of its ends, what moves it traction on round or long patches, which turns with
+nothing, and its weight; Poisson ratios are lower and the grid is another one. Meshes have radius 1.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
 
+from dine.errors import DataError
 from dine.geometry.surface import Surface
-from dine.geometry.voxels import CORNERS, voxelised
+from dine.geometry.voxels import CORNERS, Voxels, voxelised
+from dine.simulation.fields import OrganDeformations
 
 POISSON = (0.3, 0.38)
 AMPLITUDE = (0.08, 0.2)
@@ -22,7 +25,7 @@ EDGE = 0.125
 SHIFTED, HELD = 0.25, (0.2, 0.5)
 WIDTHS = (0.6, 1.2)
 _GAUSS = 0.5 + (CORNERS - 0.5) / np.sqrt(3)
-_STEP, _ITERATIONS, _TOLERANCE, _MOST_STEPS = 0.15, 12, 1e-6, 60
+_STEP, _ITERATIONS, _TOLERANCE, _MOST_STEPS, _DRAWS = 0.15, 12, 1e-6, 60, 20
 
 
 def gradients() -> np.ndarray:
@@ -40,7 +43,7 @@ def gradients() -> np.ndarray:
 class NeoHookean:
     """Cubes of W = μ/2 (tr FᵀF − 3 − 2 ln J) + λ/2 (ln J)², lengths in edges, Young's modulus 1."""
 
-    def __init__(self, voxels, stiffness: np.ndarray, poisson: float, fixed: np.ndarray):
+    def __init__(self, voxels: Voxels, stiffness: np.ndarray, poisson: float, fixed: np.ndarray):
         self.weight = stiffness * np.maximum(voxels.inside, 0.02) / 8
         self.mu = 1 / (2 * (1 + poisson))
         self.lam = poisson / ((1 + poisson) * (1 - 2 * poisson))
@@ -98,19 +101,19 @@ class NeoHookean:
         return None
 
 
-def true_field(source: Surface, seed: int, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Displacement of the vertices (V, 3) of a mesh of radius 1, and of points of its inside.
+def true_deformations(
+    source: Surface, count: int, seed: int, *, edge: float = EDGE
+) -> OrganDeformations:
+    """Of a closed mesh of radius 1; each depends on the seed and its number alone.
 
-    The second is that of ``inside_points``.
+    Raises:
+        DataError: no mesh with an inside, or parts too thin for cubes with this edge.
     """
-    rng = np.random.default_rng([12, seed, number])
-    voxels = voxelised(source, EDGE)
+    voxels = voxelised(source, edge)
     carrier = voxels.carrier(source.vertices)
-    inside = voxels.carrier(inside_points(source))
-    while True:
-        found = _drawn(source, voxels, carrier, rng)
-        if found is not None:
-            return carrier @ found, inside @ found
+    nodes = np.stack([_first(source, voxels, carrier, seed, number) for number in range(count)])
+    vertices = np.stack([carrier @ field for field in nodes])
+    return OrganDeformations(source, vertices.astype(np.float32), voxels, nodes.astype(np.float32))
 
 
 def attachment(source: Surface) -> np.ndarray:
@@ -119,10 +122,18 @@ def attachment(source: Surface) -> np.ndarray:
     return source.vertices[(middle @ np.linalg.svd(middle, full_matrices=False)[2][1]).argmax()]
 
 
-def inside_points(source: Surface) -> np.ndarray:
-    """(M, 3) points of a ball of radius 0.05 in the thickest part of a mesh of radius 1."""
-    from scipy.spatial import cKDTree
+def held(source: Surface) -> np.ndarray:
+    """Mask (V,) of the vertices that the middle of what is held may be at."""
+    return np.linalg.norm(source.vertices - attachment(source), axis=1) <= SHIFTED
 
+
+def patch(source: Surface) -> np.ndarray:
+    """Mask (V,) of the vertices of one patch of middling size that may be held."""
+    return np.linalg.norm(source.vertices - attachment(source), axis=1) <= sum(HELD) / 2
+
+
+def inside_points(source: Surface) -> np.ndarray:
+    """(50, 3) points of a ball of radius 0.05 in the thickest part of a mesh of radius 1."""
     voxels = voxelised(source, EDGE)
     deep = cKDTree(source.vertices).query(voxels.middles)[0] * (voxels.inside >= 1)
     rng = np.random.default_rng(13)
@@ -131,13 +142,32 @@ def inside_points(source: Surface) -> np.ndarray:
     return voxels.middles[deep.argmax()] + ball
 
 
-def _drawn(source, voxels, carrier, rng) -> np.ndarray | None:
+def _first(
+    source: Surface, voxels: Voxels, carrier: csr_matrix, seed: int, number: int
+) -> np.ndarray:
+    """Displacement (n, 3) of the nodes under the first loads drawn that an equilibrium is found
+    for."""
+    rng = np.random.default_rng([12, seed, number])
+    tries = (_drawn(source, voxels, carrier, rng) for _ in range(_DRAWS))
+    found = next((x for x in tries if x is not None), None)
+    if found is None:
+        raise DataError(
+            f"{source.name} bears no loads that were drawn; its parts are too thin for cubes with "
+            f"an edge of {voxels.edge:g} of the radius."
+        )
+    return found
+
+
+def _drawn(
+    source: Surface, voxels: Voxels, carrier: csr_matrix, rng: np.random.Generator
+) -> np.ndarray | None:
+    """Displacement (n, 3) of the nodes under drawn loads; None where no equilibrium is found."""
     vertices = source.vertices
     near = np.linalg.norm(vertices - attachment(source), axis=1)
     middle = vertices[rng.choice(np.flatnonzero(near <= SHIFTED))]
-    held = np.linalg.norm(vertices - middle, axis=1) <= rng.uniform(*HELD)
+    kept = np.linalg.norm(vertices - middle, axis=1) <= rng.uniform(*HELD)
     fixed = np.zeros(len(voxels.nodes), bool)
-    fixed[voxels.carried(vertices[held])[0].ravel()] = True
+    fixed[voxels.carried(vertices[kept])[0].ravel()] = True
     softer = np.exp(rng.normal(scale=0.3, size=len(voxels.cubes)))
     body = NeoHookean(voxels, softer, rng.uniform(*POISSON), fixed)
     forces = np.zeros((len(voxels.nodes), 3))
@@ -151,7 +181,9 @@ def _drawn(source, voxels, carrier, rng) -> np.ndarray | None:
     return _raised(body, forces, carrier, rng.uniform(*AMPLITUDE) / voxels.edge, voxels.edge)
 
 
-def _raised(body, forces, carrier, wanted: float, edge: float) -> np.ndarray | None:
+def _raised(
+    body: NeoHookean, forces: np.ndarray, carrier: csr_matrix, wanted: float, edge: float
+) -> np.ndarray | None:
     """The displacement (n, 3) under rising forces once its mean at the vertices is as wanted."""
     still = np.zeros((body.count, 3))
     _, tangent = body.assembled(still)
