@@ -54,8 +54,9 @@ def test_sizes_differ_in_numbers_only(name):
     results = change.pop("results")
     assert results == f"results/{name}"
     # Or only some of what there is.
-    for part in (change.get("evidence", {}), *change.get("backbones", {}).values()):
-        for key in ("only", "first_seed_only", "datasets"):
+    trials = (change.get(name, {}) for name in ("evidence", "organ"))
+    for part in (*trials, *change.get("backbones", {}).values()):
+        for key in ("only", "first_seed_only", "datasets", "questions"):
             (part or {}).pop(key, None)
 
     def leaves(value):
