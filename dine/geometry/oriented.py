@@ -135,13 +135,6 @@ def _nearest(points: np.ndarray, count: int, at: np.ndarray | slice = _EVERYWHER
     return cKDTree(points).query(points[at], k=[*range(1, count + 1)])[1]
 
 
-def rim_edges(faces: np.ndarray, count: int) -> np.ndarray:
-    """(B, 2) vertices, of ``count``, of the edges that only one of the faces (F, 3) has."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    key, times = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
-    return np.column_stack(np.divmod(key[times == 1], count))
-
-
 def rim_curve(vertices: np.ndarray, edges: np.ndarray, spacing: float) -> Curve:
     """Points on edges (B, 2) between vertices (V, 3), one for each ``spacing`` of their length."""
     first = vertices[edges[:, 0]]

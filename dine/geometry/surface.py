@@ -83,7 +83,7 @@ class Surface:
         faces = "" if self.faces is None else f", {len(self.faces)} faces"
         return f"<Surface {self.name}: {len(self.vertices)} vertices{faces}>"
 
-    @property
+    @cached_property
     def used(self) -> np.ndarray:
         """Mask (V,) of the vertices that the object consists of: of a mesh those of its faces."""
         if self.faces is None:
@@ -108,12 +108,20 @@ class Surface:
             np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
         )
 
+    @cached_property
+    def rim(self) -> np.ndarray:
+        """(B, 2) vertices of the edges where a mesh ends; no edges of a cloud."""
+        if self.faces is None:
+            return np.zeros((0, 2), np.int64)
+        return rim_edges(self.faces, len(self.vertices))
+
     def similar(self, vertices: np.ndarray) -> Surface:
         """The same with its vertices (V, 3) moved by a similarity, which keeps ratios of areas."""
         other = replace(self, vertices=vertices)
         if self.faces is not None:
             # Frozen, but for what is found once.
-            other.__dict__["area_reach"] = self.area_reach
+            for name in ("used", "area_reach", "rim"):
+                other.__dict__[name] = getattr(self, name)
         return other
 
     def _numbers(self, name: str, dtype: type) -> np.ndarray:
@@ -121,3 +129,10 @@ class Surface:
             return np.asarray(getattr(self, name), dtype=dtype)
         except (TypeError, ValueError, OverflowError) as error:
             raise DataError(f"{self.name}: the {name} are no array of numbers ({error}).") from None
+
+
+def rim_edges(faces: np.ndarray, count: int) -> np.ndarray:
+    """(B, 2) vertices, of ``count``, of the edges that only one of the faces (F, 3) has."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    key, times = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
+    return np.column_stack(np.divmod(key[times == 1], count))

@@ -9,9 +9,10 @@ import numpy as np
 
 from dine.geometry.distance import distances, spacings, surface_distance
 from dine.geometry.interpolation import FittedValues
+from dine.geometry.oriented import evenly
+from dine.geometry.rigid import Alignment, rigid_alignments, transformed
 from dine.geometry.surface import Surface
 from dine.registration.calibration import Calibration, field_values
-from dine.registration.correspondence import aligned_pairs
 from dine.registration.shapes import dense_points
 from dine.registration.surfaces import CLOSE, improbabilities
 from dine.registration.types import (
@@ -46,6 +47,9 @@ _LYING_ON = 0.03
 _MIRROR_FITS = 0.7
 # What it lowers the mean distance of rigidly aligned points to, if it is looked at more closely.
 _MIRROR_NEARER = 0.9
+# Points of each that are aligned for it.
+_MIRRORED_POINTS = 500
+_ACROSS = np.array([-1.0, 1.0, 1.0])
 
 MIRRORED = (
     "The target looks like a mirror image of the source, such as a left organ for a right one: "
@@ -240,7 +244,7 @@ def _compared(
 def mirrored(surface: Surface) -> Surface:
     """The mirror image, in the plane across the first axis; normals of faces still point out."""
     faces = None if surface.faces is None else surface.faces[:, ::-1]
-    return Surface(surface.vertices * [-1.0, 1.0, 1.0], faces, surface.name)
+    return Surface(surface.vertices * _ACROSS, faces, surface.name)
 
 
 def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> bool:
@@ -252,15 +256,23 @@ def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> boo
     near = np.linalg.norm(found.field, axis=1).mean() < _LYING_ON
     if near or found.improbability is None or settings.overlap is not Overlap.AUTO:
         return False
-    otherwise = aligned_pairs(
-        mirrored(pair.source), pair.target, replace(settings, prealign="auto"), "none"
+    places, seen = (
+        points[evenly(points, _MIRRORED_POINTS)]
+        for points in (pair.places, pair.alignment.restore(pair.goal))
     )
-    if min(map(_apart, otherwise)) > _MIRROR_NEARER * _apart(pair):
+    nearest = _MIRROR_NEARER * _apart(pair.alignment.align(places), seen)
+    image = mirrored(pair.source)
+    otherwise = [
+        replace(pair, source=image, alignment=Alignment.of(pair.places * _ACROSS, motion))
+        for motion in rigid_alignments(places * _ACROSS, seen)
+        if _apart(transformed(places * _ACROSS, motion), seen) <= nearest
+    ]
+    if not otherwise:
         return False
     as_given = improbabilities([pair], settings, CLOSE)[0]
     return min(improbabilities(otherwise, settings, CLOSE)) < _MIRROR_FITS * as_given
 
 
-def _apart(pair: Pair) -> float:
-    """Mean distance between the points of both scans as they are aligned, both ways."""
-    return float(distances(pair.start, pair.goal).mean() + distances(pair.goal, pair.start).mean())
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean distance of (N, 3) points to the nearest of (M, 3) others, and of these to those."""
+    return float(distances(a, b).mean() + distances(b, a).mean())

@@ -27,8 +27,8 @@ from dine.models.backbones import Backbone, marginal_deviation
 from dine.progress import stage
 from dine.refinement.refine import DEFAULTS, Observed, Options, refine
 from dine.registration.shapes import FEWEST, drawn
-from dine.registration.surfaces import improbabilities, refined_on_surfaces
-from dine.registration.types import Correspondence, Model, Overlap, Pair, Settings
+from dine.registration.surfaces import FULL, QUICK, Detail, refined_on_surfaces
+from dine.registration.types import Correspondence, Model, Motion, Overlap, Pair, Settings
 
 # A source point is shown by the target if a target point ends up within so many spacings of it.
 _RETURN = 3.0
@@ -40,11 +40,14 @@ _SHARED = 0.5
 _LACKING = 0.1
 _PAST_THE_END = (0.03, 0.02)
 _AS_WELL = 0.02
-# Where scans overlap: alignments that are carried to the end, no motion and those at most so much
-# less probable as judged by stiff fields; and what a later one must lower the improbability to.
-_CARRIED = 2
-_ABOUT_AS_GOOD = 1.25
-_BETTER = 0.9
+# Shares of both scans that the other shows, between which they are parts that overlap: less is
+# little to go by, and what shows more is a whole or lies within the other.
+_OVERLAPPING = (0.45, 0.96)
+# Alignments that are carried to the end: the most probable as far as is seen at a quick look, if no
+# more improbable by this factor than the first and farther from each other, in radii, than that.
+_CARRIED = 3
+_ABOUT_AS_GOOD = 1.1
+_ALIKE = 0.1
 
 
 def correspondence_of(
@@ -65,7 +68,7 @@ def correspondence_of(
         as_parts = replace(settings, overlap=Overlap.BOTH)
         pairs = aligned_pairs(source, target, as_parts, model.convention)
         parts = _most_probable(pairs, model, as_parts)
-        if parts[1].unmet < found[1].unmet + _AS_WELL:
+        if overlap(parts[1]) and parts[1].unmet < found[1].unmet + _AS_WELL:
             return parts[0], replace(parts[1], overlap=Overlap.BOTH)
     return found[0], replace(found[1], overlap=settings.overlap)
 
@@ -93,6 +96,12 @@ def lacks(found: Correspondence) -> bool:
     more, less = _PAST_THE_END
     parts = min(found.shown) < 1 - more and max(found.shown) < 1 - less
     return parts or found.unmet > _LACKING
+
+
+def overlap(found: Correspondence) -> bool:
+    """Whether each scan shows about half of the other or more, and lacks some of it."""
+    least, most = _OVERLAPPING
+    return least < min(found.shown) and max(found.shown) < most
 
 
 def aligned_pairs(
@@ -165,22 +174,43 @@ def _of_parts(
 ) -> tuple[Pair, Correspondence]:
     """The same where each scan shows what the other does not.
 
-    Once bent, parts can fit by chance. How they fit while they hardly bend says more, and then the
-    first is kept, unless another explains the surfaces better in the end.
+    Which alignment is right shows only once the source is deformed, and parts can fit by chance:
+    the wrong way round, say, one within the other. All are looked at quickly, and those in which
+    scans overlap come first.
     """
-    values = improbabilities(pairs, settings) if len(pairs) > 1 else [0.0]
-    order = sorted(range(1, len(pairs)), key=values.__getitem__)
-    likely = [i for i in order if values[i] <= _ABOUT_AS_GOOD * values[0]]
-    best = None
-    for i in [0, *likely[: _CARRIED - 1]]:
-        one = pairs[i], correspond(pairs[i], model, settings)
-        if best is None or one[1].improbability < _BETTER * best[1].improbability:
-            best = one
-    return best
+
+    def unlikely(one: tuple[Pair, Correspondence]) -> tuple[bool, float]:
+        return not overlap(one[1]), one[1].improbability
+
+    looks = []
+    for pair in pairs:
+        found = correspond(pair, model, settings, QUICK)
+        if found.improbability is None:  # the same points, which leave nothing open
+            return pair, found
+        looks.append((pair, found))
+    looks.sort(key=unlikely)
+    likely = _worth_more([one for one in looks if overlap(one[1]) == overlap(looks[0][1])])
+    return min(((pair, correspond(pair, model, settings)) for pair in likely), key=unlikely)
 
 
-def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:
-    """Where the source's points belong.
+def _worth_more(looks: Sequence[tuple[Pair, Correspondence]]) -> list[Pair]:
+    """Alignments to be carried to the end, of such in the order of what a quick look says."""
+    places = looks[0][0].places
+    kept, fields = [], []
+    for pair, found in looks:
+        if found.improbability > _ABOUT_AS_GOOD * looks[0][1].improbability:
+            break
+        moved = Motion(pair.alignment, found.anywhere)(places) / pair.alignment.frame.scale
+        if all(np.linalg.norm(moved - x, axis=1).mean() > _ALIKE for x in fields):
+            kept.append(pair)
+            fields.append(moved)
+    return kept[:_CARRIED]
+
+
+def correspond(
+    pair: Pair, model: Model, settings: Settings, detail: Detail = FULL
+) -> Correspondence:
+    """Where the source's points belong; ``detail``: of the look at surfaces.
 
     Raises:
         DataError: the target, a part of the source, ends up beside it.
@@ -191,7 +221,7 @@ def correspond(pair: Pair, model: Model, settings: Settings) -> Correspondence:
     # Scans that hold the same points say of each where it went.
     if settings.guide is None and (distances(found.moved, pair.goal) < _SAME).mean() >= _SHARED:
         return replace(found, indicator=np.zeros(len(found.start)))
-    return refined_on_surfaces(pair, found, settings)
+    return refined_on_surfaces(pair, found, settings, detail)
 
 
 def _from_points(pair: Pair, model: Model, settings: Settings) -> Correspondence:

@@ -34,6 +34,8 @@ _APART = 0.25
 _UNUSUAL_GAP = 10.0
 # Points spread evenly for each that is drawn of a cloud.
 _EVENLY = 2
+# Vertices that are looked at first.
+_LOOKED_AT = 2000
 _UNITS = {1000: "metres and millimetres", 100: "metres and centimetres", 10: "cm and mm"}
 _UNITS |= {25.4: "inches and millimetres", 2.54: "inches and centimetres"}
 
@@ -166,6 +168,11 @@ def _size(surface: Surface, what: str) -> float:
     return size
 
 
+def _on_a_line(points: np.ndarray) -> bool:
+    widths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return widths[1] <= 1e-6 * widths[0]
+
+
 def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) -> SurfaceSamples:
     """Points of a surface; all of a cloud that has fewer.
 
@@ -176,9 +183,8 @@ def drawn(surface: Surface, points: int, rng: np.random.Generator, what: str) ->
     if points < FEWEST:
         raise ConfigError(f"The number of points is {points}; expected at least {FEWEST}.")
     extent = surface.vertices[surface.used]
-    extent = extent - extent.mean(axis=0)
-    widths = np.linalg.svd(extent, compute_uv=False)
-    if widths[1] <= 1e-6 * widths[0]:
+    # What some points leave is not of a line.
+    if _on_a_line(extent[:: max(len(extent) // _LOOKED_AT, 1)]) and _on_a_line(extent):
         raise DataError(
             f"All points of {surface.name}, the {what}, lie on one line; expected the surface of "
             "an object."

@@ -19,7 +19,6 @@ from dine.geometry.oriented import (
     fitted_planes,
     fitted_quadrics,
     rim_curve,
-    rim_edges,
     rim_points,
     unit,
 )
@@ -37,8 +36,6 @@ from dine.refinement.surface import (
 from dine.registration.shapes import near_points
 from dine.registration.types import Correspondence, Overlap, Pair, Settings
 
-SOURCE_POINTS = 2000
-TARGET_POINTS = 20_000
 # Drawn for each that is kept, so that what is kept lies evenly.
 _DRAWN = 4
 # Error of a coarse field, which a start that the process allows is fitted to.
@@ -58,18 +55,29 @@ _LOOKED_AT = 2000
 _SETTLING = 3
 
 
-class Glance(NamedTuple):
-    """How closely rigid alignments are looked at: points of the source and of the target, and the
-    standard deviation that ends it."""
+class Detail(NamedTuple):
+    """How closely two surfaces are looked at.
 
-    source: int
-    target: int
-    end: float
+    Attributes:
+        source: points of it, spread evenly.
+        target: points of it.
+        rank: of the process.
+        rounds: for each part of the search.
+        last: the least standard deviation across the surface.
+    """
+
+    source: int = 2000
+    target: int = 20_000
+    rank: int = SURFACE.rank
+    rounds: int = SurfaceOptions.rounds
+    last: float = SurfaceOptions.last
 
 
-QUICK = Glance(400, 2000, _ROUGH_END)
-CLOSE = Glance(800, 5000, 0.02)
-_GLANCES = 12
+FULL = Detail()
+# Which of several alignments are worth more.
+QUICK = Detail(400, 2000, 120, 8, 0.02)
+# Whether a mirror image fits better.
+CLOSE = Detail(800, 5000, STIFFER.rank, 12, 0.02)
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,7 @@ def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> O
         same_side = np.einsum("nc,nc->n", planes, normals) >= 0
         normals = planes * np.where(same_side, 1.0, -1.0)[:, None]
     ends = np.zeros(len(surface.vertices), bool)
-    ends[rim_edges(surface.faces, len(ends))] = True
+    ends[surface.rim] = True
     rim = ends[samples.faces_vertices].any(axis=1)
     # In the order of a tree neighbours follow each other, which makes searches quicker.
     return OrientedPoints(points, normals, rim).at(cKDTree(points).indices)
@@ -118,36 +126,23 @@ def oriented_points(surface: Surface, count: int, rng: np.random.Generator) -> O
 
 def rim_of(surface: Surface, spacing: float) -> Curve:
     """Where a mesh ends, a point for each ``spacing`` of its length; no points of a cloud."""
-    faces = np.zeros((0, 3), int) if surface.faces is None else surface.faces
-    return rim_curve(surface.vertices, rim_edges(faces, len(surface.vertices)), spacing)
+    return rim_curve(surface.vertices, surface.rim, spacing)
 
 
-def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -> Correspondence:
+def refined_on_surfaces(
+    pair: Pair, found: Correspondence, settings: Settings, detail: Detail = FULL
+) -> Correspondence:
     """What was found between points, refined between the surfaces that they were drawn on."""
     stage("surfaces")
-    rng = np.random.default_rng([7, settings.seed])
-    source, target = (
-        surface.similar(normalise(surface.vertices))
-        for surface, normalise in (
-            (pair.source, pair.alignment.normalise),
-            (pair.target, pair.alignment.frame.normalise),
-        )
-    )
-    drawn = oriented_points(source, _DRAWN * SOURCE_POINTS, rng)
-    drawn = drawn.at(evenly(drawn.points, SOURCE_POINTS))
-    tree = cKDTree(drawn.points)
-    spacing = float(np.median(tree.query(drawn.points, k=2)[0][:, 1]))
-    moving = Outline(drawn, rim_of(source, spacing), *_measured(source))
-    seen = oriented_points(target, TARGET_POINTS, rng)
-    fixed = Outline(seen, rim_of(target, spacing / 4), *_measured(target))
+    moving, fixed = _outlines(pair, settings, detail)
     guides = settings.guide.within(pair.alignment) if settings.guide else NO_GUIDES
     places = np.vstack([moving.places, guides.places])
-    root = SURFACE.fitted(places)
+    root = SURFACE._replace(rank=detail.rank).fitted(places)
     prior = LinearGaussian.of_kernel(root.root)
     starts = [np.zeros_like(places)]
     if found.field.any():
         starts.insert(0, root.root @ _fitted(root.at(found.start), found.field))
-    options = _options(settings.overlap)
+    options = replace(_options(settings.overlap), rounds=detail.rounds, last=detail.last)
     if settings.overlap is Overlap.BOTH:
         # Of parts, a loose field would make wholes of each other: first, some that hardly bend.
         field, starts = starts[0], []
@@ -164,7 +159,7 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
     unmet, shown, lacking = _covered(end, settings.overlap)
-    nearest = tree.query(found.start)[1]
+    nearest = cKDTree(moving.surface.points).query(found.start)[1]
     return replace(
         found,
         field=anywhere(found.start),
@@ -174,6 +169,26 @@ def refined_on_surfaces(pair: Pair, found: Correspondence, settings: Settings) -
         unmet=unmet,
         shown=shown,
         supported=~lacking[nearest],
+    )
+
+
+def _outlines(pair: Pair, settings: Settings, detail: Detail) -> tuple[Outline, Outline]:
+    """Of both surfaces as they are aligned, normalised frame."""
+    rng = np.random.default_rng([7, settings.seed])
+    source, target = (
+        surface.similar(normalise(surface.vertices))
+        for surface, normalise in (
+            (pair.source, pair.alignment.normalise),
+            (pair.target, pair.alignment.frame.normalise),
+        )
+    )
+    drawn = oriented_points(source, _DRAWN * detail.source, rng)
+    drawn = drawn.at(evenly(drawn.points, detail.source))
+    spacing = float(np.median(cKDTree(drawn.points).query(drawn.points, k=2)[0][:, 1]))
+    seen = oriented_points(target, detail.target, rng)
+    return (
+        Outline(drawn, rim_of(source, spacing), *_measured(source)),
+        Outline(seen, rim_of(target, spacing / 4), *_measured(target)),
     )
 
 
@@ -194,21 +209,19 @@ def _rough(
     return replace(options, firsts=(first,), between=end, last=end, rounds=rounds)
 
 
-def improbabilities(
-    pairs: Sequence[Pair], settings: Settings, glance: Glance = QUICK
-) -> list[float]:
+def improbabilities(pairs: Sequence[Pair], settings: Settings, detail: Detail) -> list[float]:
     """How little each of several alignments of two scans explains: −log of the evidence, up to a
     constant, of the surfaces and a field that hardly bends, on few points."""
     rng = np.random.default_rng([8, settings.seed])
     source, target = (
         drawn.at(evenly(drawn.points, count))
         for drawn, count in (
-            (oriented_points(pairs[0].source, _DRAWN * glance.source, rng), glance.source),
-            (oriented_points(pairs[0].target, _DRAWN * glance.target, rng), glance.target),
+            (oriented_points(pairs[0].source, _DRAWN * detail.source, rng), detail.source),
+            (oriented_points(pairs[0].target, _DRAWN * detail.target, rng), detail.target),
         )
     )
     none = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
-    options = _rough(_options(settings.overlap), _ROUGHLY[0][1], _GLANCES, glance.end)
+    options = _rough(_options(settings.overlap), _ROUGHLY[0][1], detail.rounds, detail.last)
     found = []
     for pair in pairs:
         normals = source.normals @ pair.alignment.matrix[:3, :3].T

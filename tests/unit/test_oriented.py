@@ -11,9 +11,9 @@ from dine.geometry.oriented import (
     fitted_planes,
     fitted_quadrics,
     rim_curve,
-    rim_edges,
     unit,
 )
+from dine.geometry.surface import rim_edges
 
 
 @pytest.fixture
