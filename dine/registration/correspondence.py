@@ -43,11 +43,13 @@ _AS_WELL = 0.02
 # Shares of both scans that the other shows, between which they are parts that overlap: less is
 # little to go by, and what shows more is a whole or lies within the other.
 _OVERLAPPING = (0.45, 0.96)
-# Alignments that are carried to the end: the most probable as far as is seen at a quick look, if no
-# more improbable by this factor than the first and farther from each other, in radii, than that.
+# Alignments that are carried to the end: the first, and others that a quick look finds about as
+# probable as the likeliest and farther than so many radii from those; and what a later one must
+# lower the improbability to.
 _CARRIED = 3
 _ABOUT_AS_GOOD = 1.1
 _ALIKE = 0.1
+_BETTER = 0.9
 
 
 def correspondence_of(
@@ -175,33 +177,41 @@ def _of_parts(
     """The same where each scan shows what the other does not.
 
     Which alignment is right shows only once the source is deformed, and parts can fit by chance:
-    the wrong way round, say, one within the other. All are looked at quickly, and those in which
-    scans overlap come first.
+    the wrong way round, say, one within the other. All are looked at quickly. The first is carried
+    to the end and kept, unless another in which scans overlap is clearly more probable.
     """
-
-    def unlikely(one: tuple[Pair, Correspondence]) -> tuple[bool, float]:
-        return not overlap(one[1]), one[1].improbability
-
     looks = []
     for pair in pairs:
         found = correspond(pair, model, settings, QUICK)
         if found.improbability is None:  # the same points, which leave nothing open
             return pair, found
         looks.append((pair, found))
-    looks.sort(key=unlikely)
-    likely = _worth_more([one for one in looks if overlap(one[1]) == overlap(looks[0][1])])
-    return min(((pair, correspond(pair, model, settings)) for pair in likely), key=unlikely)
+    best = None
+    for pair in _worth_more(looks):
+        one = pair, correspond(pair, model, settings)
+        if best is None or _unlikely(one[1]) < _unlikely(best[1], _BETTER):
+            best = one
+    return best
+
+
+def _unlikely(found: Correspondence, share: float = 1.0) -> tuple[bool, float]:
+    """What orders correspondences of parts, the likeliest first: that scans overlap, and then a
+    share of the improbability."""
+    return not overlap(found), share * found.improbability
 
 
 def _worth_more(looks: Sequence[tuple[Pair, Correspondence]]) -> list[Pair]:
-    """Alignments to be carried to the end, of such in the order of what a quick look says."""
-    places = looks[0][0].places
+    """Alignments to be carried to the end, given what a quick look at each found: the first, and of
+    the others those that are about as probable as the likeliest."""
+    first, *others = looks
+    others.sort(key=lambda look: _unlikely(look[1]))
+    overlapping, limit = _unlikely(min((look[1] for look in looks), key=_unlikely), _ABOUT_AS_GOOD)
+    places = first[0].places
     kept, fields = [], []
-    for pair, found in looks:
-        if found.improbability > _ABOUT_AS_GOOD * looks[0][1].improbability:
-            break
+    for pair, found in [first, *others]:
+        worth = not kept or _unlikely(found) <= (overlapping, limit)
         moved = Motion(pair.alignment, found.anywhere)(places) / pair.alignment.frame.scale
-        if all(np.linalg.norm(moved - x, axis=1).mean() > _ALIKE for x in fields):
+        if worth and all(np.linalg.norm(moved - x, axis=1).mean() > _ALIKE for x in fields):
             kept.append(pair)
             fields.append(moved)
     return kept[:_CARRIED]
