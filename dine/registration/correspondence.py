@@ -40,9 +40,10 @@ _SHARED = 0.5
 _LACKING = 0.1
 _PAST_THE_END = (0.03, 0.02)
 _AS_WELL = 0.02
-# Shares of both scans that the other shows, between which they are parts that overlap: less is
-# little to go by, and what shows more is a whole or lies within the other.
-_OVERLAPPING = (0.45, 0.96)
+# Share of each scan that the other shows, from which `auto` takes them for parts; and from which
+# one lies within the other, which is the less likely answer.
+_OVERLAP = 0.43
+_WITHIN = 0.96
 # Alignments that are carried to the end: the first, and others that a quick look finds about as
 # probable as the likeliest and farther than so many radii from those; and what a later one must
 # lower the improbability to.
@@ -70,7 +71,8 @@ def correspondence_of(
         as_parts = replace(settings, overlap=Overlap.BOTH)
         pairs = aligned_pairs(source, target, as_parts, model.convention)
         parts = _most_probable(pairs, model, as_parts)
-        if overlap(parts[1]) and parts[1].unmet < found[1].unmet + _AS_WELL:
+        more = parts[1].unmet - found[1].unmet
+        if min(parts[1].shown) > _OVERLAP and more < _AS_WELL:
             return parts[0], replace(parts[1], overlap=Overlap.BOTH)
     return found[0], replace(found[1], overlap=settings.overlap)
 
@@ -98,12 +100,6 @@ def lacks(found: Correspondence) -> bool:
     more, less = _PAST_THE_END
     parts = min(found.shown) < 1 - more and max(found.shown) < 1 - less
     return parts or found.unmet > _LACKING
-
-
-def overlap(found: Correspondence) -> bool:
-    """Whether each scan shows about half of the other or more, and lacks some of it."""
-    least, most = _OVERLAPPING
-    return least < min(found.shown) and max(found.shown) < most
 
 
 def aligned_pairs(
@@ -178,7 +174,7 @@ def _of_parts(
 
     Which alignment is right shows only once the source is deformed, and parts can fit by chance:
     the wrong way round, say, one within the other. All are looked at quickly. The first is carried
-    to the end and kept, unless another in which scans overlap is clearly more probable.
+    to the end and kept, unless another is clearly more probable.
     """
     looks = []
     for pair in pairs:
@@ -195,9 +191,9 @@ def _of_parts(
 
 
 def _unlikely(found: Correspondence, share: float = 1.0) -> tuple[bool, float]:
-    """What orders correspondences of parts, the likeliest first: that scans overlap, and then a
-    share of the improbability."""
-    return not overlap(found), share * found.improbability
+    """What orders correspondences of parts, the likeliest first: that neither lies within the
+    other, and then a share of the improbability."""
+    return max(found.shown) > _WITHIN, share * found.improbability
 
 
 def _worth_more(looks: Sequence[tuple[Pair, Correspondence]]) -> list[Pair]:
@@ -205,11 +201,11 @@ def _worth_more(looks: Sequence[tuple[Pair, Correspondence]]) -> list[Pair]:
     the others those that are about as probable as the likeliest."""
     first, *others = looks
     others.sort(key=lambda look: _unlikely(look[1]))
-    overlapping, limit = _unlikely(min((look[1] for look in looks), key=_unlikely), _ABOUT_AS_GOOD)
+    likeliest = min((found for _, found in looks), key=_unlikely)
     places = first[0].places
     kept, fields = [], []
     for pair, found in [first, *others]:
-        worth = not kept or _unlikely(found) <= (overlapping, limit)
+        worth = not kept or _unlikely(found) <= _unlikely(likeliest, _ABOUT_AS_GOOD)
         moved = Motion(pair.alignment, found.anywhere)(places) / pair.alignment.frame.scale
         if worth and all(np.linalg.norm(moved - x, axis=1).mean() > _ALIKE for x in fields):
             kept.append(pair)
