@@ -11,6 +11,7 @@ from scipy.linalg import solve
 from scipy.spatial import cKDTree
 
 from dine.data.sampling import sample_surface
+from dine.geometry.distance import spacings
 from dine.geometry.interpolation import within_reach
 from dine.geometry.oriented import (
     Curve,
@@ -184,7 +185,7 @@ def _outlines(pair: Pair, settings: Settings, detail: Detail) -> tuple[Outline, 
     )
     drawn = oriented_points(source, _DRAWN * detail.source, rng)
     drawn = drawn.at(evenly(drawn.points, detail.source))
-    spacing = float(np.median(cKDTree(drawn.points).query(drawn.points, k=2)[0][:, 1]))
+    spacing = float(np.median(spacings(drawn.points)))
     seen = oriented_points(target, detail.target, rng)
     return (
         Outline(drawn, rim_of(source, spacing), *_measured(source)),
