@@ -9,7 +9,6 @@ import numpy as np
 
 from dine.geometry.distance import distances, spacings, surface_distance
 from dine.geometry.interpolation import FittedValues
-from dine.geometry.oriented import evenly
 from dine.geometry.rigid import Alignment, rigid_alignments, transformed
 from dine.geometry.surface import Surface
 from dine.registration.calibration import Calibration, field_values
@@ -47,8 +46,6 @@ _LYING_ON = 0.03
 _MIRROR_FITS = 0.7
 # What it lowers the mean distance of rigidly aligned points to, if it is looked at more closely.
 _MIRROR_NEARER = 0.9
-# Points of each that are aligned for it.
-_MIRRORED_POINTS = 500
 _ACROSS = np.array([-1.0, 1.0, 1.0])
 
 MIRRORED = (
@@ -256,14 +253,11 @@ def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> boo
     near = np.linalg.norm(found.field, axis=1).mean() < _LYING_ON
     if near or found.improbability is None or settings.overlap is not Overlap.AUTO:
         return False
-    places, seen = (
-        points[evenly(points, _MIRRORED_POINTS)]
-        for points in (pair.places, pair.alignment.restore(pair.goal))
-    )
+    places, seen = pair.places, pair.alignment.restore(pair.goal)
     nearest = _MIRROR_NEARER * _apart(pair.alignment.align(places), seen)
     image = mirrored(pair.source)
     otherwise = [
-        replace(pair, source=image, alignment=Alignment.of(pair.places * _ACROSS, motion))
+        replace(pair, source=image, alignment=Alignment.of(places * _ACROSS, motion))
         for motion in rigid_alignments(places * _ACROSS, seen)
         if _apart(transformed(places * _ACROSS, motion), seen) <= nearest
     ]

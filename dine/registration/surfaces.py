@@ -78,7 +78,7 @@ FULL = Detail()
 # Which of several alignments are worth more.
 QUICK = Detail(400, 2000, 120, 8, 0.02)
 # Whether a mirror image fits better.
-CLOSE = Detail(800, 5000, STIFFER.rank, 12, 0.02)
+CLOSE = Detail(500, 2500, STIFFER.rank, 8, 0.02)
 
 
 @dataclass(frozen=True)
