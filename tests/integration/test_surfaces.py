@@ -18,10 +18,11 @@ from dine.io.readers import read_surface
 from dine.io.writers import write_surface
 from dine.refinement.process import SURFACE
 from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
+from dine.registration import correspondence
 from dine.registration.assessment import mirrored
 from dine.registration.correspondence import lacks
 from dine.registration.surfaces import oriented_points
-from dine.registration.types import Correspondence
+from dine.registration.types import Correspondence, Overlap, Settings
 
 pytestmark = pytest.mark.numerical
 NO_CURVE = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -388,3 +389,20 @@ def test_parts_that_can_lie_within_each_other_overlap_instead(seed):
 def only_faces(surface, keep):
     used, index = np.unique(surface.faces[keep], return_inverse=True)
     return Surface(surface.vertices[used], index.reshape(-1, 3))
+
+
+@pytest.mark.parametrize(("shown", "taken"), [((0.9, 0.5), True), ((0.9, 0.3), False)])
+def test_auto_takes_scans_for_parts_only_if_they_overlap(shown, taken, monkeypatch):
+    """Any whole can be bent so that it lies within some of another."""
+    point = np.zeros((1, 3))
+    whole = Correspondence(point, point, point, None, np.ones(1, bool), unmet=0.2)
+    parts = dataclasses.replace(whole, unmet=0.0, shown=shown)
+    found = {Overlap.AUTO: whole, Overlap.BOTH: parts}
+    monkeypatch.setattr(correspondence, "aligned_pairs", lambda *_: [])
+    monkeypatch.setattr(
+        correspondence, "_most_probable", lambda pairs, model, how: (None, found[how.overlap])
+    )
+    settings = Settings("auto", 40, Overlap.AUTO, 1024, 0, None, True, None)
+    _, chosen = correspondence.correspondence_of(organ(), organ(), dine.load_model(), settings)
+    assert (chosen.overlap is Overlap.BOTH) == taken
+    assert chosen.unmet == (0.0 if taken else 0.2)
