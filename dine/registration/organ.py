@@ -77,6 +77,13 @@ class Placed:
     alignment: Alignment
     loose: bool
 
+    @classmethod
+    def lying(cls, prior: OrganPrior, matrix: np.ndarray, loose: bool) -> Placed:
+        """As a 4×4 matrix says, by the template's own vertices: those that no face uses may lie
+        anywhere."""
+        alignment = Alignment.of(prior.template.vertices[prior.template.used], matrix)
+        return cls(prior, alignment, loose)
+
     @cached_property
     def rotation(self) -> np.ndarray:
         """(3, 3), of the alignment."""
@@ -102,8 +109,7 @@ class Placed:
         frame = self.alignment.frame
         middle = frame.center
         motion[:3, 3] = middle + frame.scale * shift - motion[:3, :3] @ middle
-        matrix = motion @ self.alignment.matrix
-        return replace(self, alignment=_aligned(self.prior, matrix))
+        return Placed.lying(self.prior, motion @ self.alignment.matrix, self.loose)
 
 
 @dataclass(frozen=True)
@@ -153,11 +159,6 @@ class OrganField:
         carrier, points = _known_at(self.placed.prior, points)
         places = self.placed.alignment.normalise(points)
         return deviation_and_bound(self.covariance(carrier, places))
-
-
-def _aligned(prior: OrganPrior, matrix: np.ndarray) -> Alignment:
-    """Of the template's own vertices: those that no face uses may lie anywhere."""
-    return Alignment.of(prior.template.vertices[prior.template.used], matrix)
 
 
 def _known_at(prior: OrganPrior, points: np.ndarray) -> tuple[csr_matrix, np.ndarray]:
@@ -283,7 +284,7 @@ def _most_probable(
 ) -> OrganField:
     found = []
     for matrix in matrices:
-        placed = Placed(prior, _aligned(prior, matrix), loose)
+        placed = Placed.lying(prior, matrix, loose)
         if loose:
             for _ in range(_POSES):
                 placed = placed.turned(search.found(placed, _POSE).posterior)

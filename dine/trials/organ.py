@@ -25,7 +25,7 @@ from dine.classical.methods import CLASSICAL
 from dine.config import OrganTrial, Simulation, TrialMethod
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.oriented import evenly
-from dine.geometry.rigid import Alignment, rigid_alignment, rigid_alignments, transformed
+from dine.geometry.rigid import motion_between, rigid_alignment, rigid_alignments, transformed
 from dine.geometry.surface import Surface
 from dine.priors.gaussian import LinearGaussian, Posterior, covariance_root
 from dine.priors.organ import OrganPrior
@@ -48,6 +48,8 @@ _TURNED = 15
 # bounds are looked at.
 _FEW, _GIVEN, _BOUNDED = 1000, 800, 500
 _RANK, _TOLERANCE = 300, 1e-4
+# How often the template is turned as the places given say, where the pose is not known.
+_POSES = 3
 ERRORS = ("hidden", "seen", "target")
 COLUMNS = ["about", "condition", "method", "deformation", *ERRORS, "within"]
 
@@ -79,10 +81,17 @@ class Case:
         scan = replace(self.scan, vertices=motion.apply(self.scan.vertices))
         return replace(self, scan=scan, motion=motion)
 
+    def shown(self, places: np.ndarray) -> np.ndarray:
+        """Places (N, 3) as the scan lies."""
+        return places if self.motion is None else self.motion.apply(places)
+
+    def as_it_lay(self, places: np.ndarray) -> np.ndarray:
+        """Places (N, 3) of the scan where it had not been turned."""
+        return places if self.motion is None else self.motion.inv().apply(places)
+
     def errors(self, vertices: np.ndarray, deep: np.ndarray) -> dict[str, float]:
         """Of moved vertices (V, 3) and points inside (M, 3)."""
-        if self.motion is not None:
-            vertices, deep = (self.motion.inv().apply(x) for x in (vertices, deep))
+        vertices, deep = self.as_it_lay(vertices), self.as_it_lay(deep)
         error = np.linalg.norm(vertices - self.truth, axis=1)
         return {
             "hidden": float(error[~self.seen].mean()),
@@ -191,14 +200,26 @@ def _with_places(case: Case, prior: OrganPrior) -> dict[str, float]:
     vertices = case.template.vertices
     given = np.flatnonzero(case.seen)
     given = given[evenly(vertices[given], _GIVEN)]
-    placed = Placed(prior, Alignment.of(vertices, np.eye(4)), loose=False)
-    places, truth = (placed.alignment.normalise(x[given]) for x in (vertices, case.truth))
+    here, there = vertices[given], case.shown(case.truth)[given]
+    loose = case.motion is not None
+    placed = Placed.lying(prior, motion_between(here, there) if loose else np.eye(4), loose)
+    field = _given(placed, given, there)
+    for _ in range(_POSES if loose else 0):
+        placed = placed.turned(field.posterior)
+        field = _given(placed, given, there)
+    return _measured(case, field)
+
+
+def _given(placed: Placed, given: np.ndarray, there: np.ndarray) -> OrganField:
+    """The field that brings given vertices of a template to places (N, 3) of the scan."""
+    prior, alignment = placed.prior, placed.alignment
+    places = alignment.normalise(prior.template.vertices[given])
     root = covariance_root(places, prior.widths, prior.amplitudes, rank=_RANK, tolerance=_TOLERANCE)
     mean, modes = placed.at(prior.at_vertices()[given], places)
     precision = np.tile(NOISE**-2 * np.eye(3), (len(given), 1, 1))
-    pulled = NOISE**-2 * (truth - places)
+    pulled = NOISE**-2 * (alignment.frame.normalise(there) - places)
     posterior = Posterior(LinearGaussian(mean, modes, root.root), pulled, precision)
-    return _measured(case, OrganField(placed, posterior, root, 0.0))
+    return OrganField(placed, posterior, root, 0.0)
 
 
 def _measured(case: Case, field: OrganField) -> dict[str, float]:
@@ -211,8 +232,7 @@ def _measured(case: Case, field: OrganField) -> dict[str, float]:
     hidden = np.flatnonzero(~case.seen)
     few = hidden[:: max(1, len(hidden) // _BOUNDED)]
     _, bound = deviation_and_bound(field.covariance(prior.at_vertices()[few], places[few]))
-    back = moved if case.motion is None else case.motion.inv().apply(moved)
-    error = np.linalg.norm(back - case.truth, axis=1)
+    error = np.linalg.norm(case.as_it_lay(moved) - case.truth, axis=1)
     return case.errors(moved, moved_deep) | {"within": float((error[few] <= bound).mean())}
 
 
