@@ -10,7 +10,7 @@ from dine.config import Pairs
 from dine.data.obtain import SYNTHETIC
 from dine.data.prepare import prepare_pairs
 from dine.data.raw import Deformations, synthesise
-from dine.files import write_json
+from dine.files import file_digest, write_json
 
 TARGET = 20.0
 POINTS = 1024
@@ -57,7 +57,9 @@ def _raw(folder: Path, shape: str, targets: int) -> Path:
         seed=0,
     )
     synthesise(folder / "raw", deformations, shape, PAIRS // targets)
-    write_json(folder / "raw.json", {"folder": str(folder / "raw"), "origin": SYNTHETIC})
+    content = file_digest(folder / "raw" / "provenance.json")
+    facts = {"folder": str(folder / "raw"), "origin": SYNTHETIC, "content": content}
+    write_json(folder / "raw.json", facts)
     return folder / "raw.json"
 
 

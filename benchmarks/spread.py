@@ -3,28 +3,33 @@
     python benchmarks/spread.py results run-of-another-seed/results … > spread.md
 
 Each argument is the results folder of a finished run. Printed as Markdown: how each run was made;
-mean Chamfer distances over all runs, and what all of them say of each prior; for each prior,
-dataset and backbone the difference of its mean Chamfer distance to the control's, run by run, with
-the verdict; and the standard deviation over runs, which is what `evaluation.training_spread` stands
-for. Ends with 1 if one run says lower and another higher.
+mean Chamfer distances over all runs, and what all of them say of each prior, also by level; for
+each prior, dataset and backbone the difference of its mean Chamfer distance to the control's, run
+by run, with the verdict; and the standard deviation over runs, which is what
+`evaluation.training_spread` and `evaluation.training_spread_outliers` stand for. Ends with 1 if one
+run says lower and another higher.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from dine import config as dine_config
+from dine.config import CONTROL, STAGE1
+from dine.evaluation.statistics import spread_of
 from dine.files import read_json
 from dine.reporting.comparisons import effects
 from dine.reporting.loading import load_metrics
 from dine.reporting.names import METHODS, OBJECTS, display_name
 from dine.results import CLEAN, Results, runs, trained_on
 
-KEYS = ["objects", "dataset", "backbone", "method"]
+PLACE = ["objects", "dataset", "backbone"]
+KEYS = [*PLACE, "method"]
 MARKS = {"lower": "", "higher": " (higher)", "undecided": " (undecided)"}
 
 
@@ -39,7 +44,7 @@ def read(folder: Path) -> tuple[dict[str, str], pd.DataFrame, pd.DataFrame]:
     made["λ"] = ", ".join(
         f"{name} {value:g}" for name, value in read_json(files.search)["selected"].items()
     )
-    return made, metrics, effects(metrics, spread=settings.evaluation.training_spread)
+    return made, metrics, effects(metrics, spread=spread_of(settings.evaluation))
 
 
 def main(folders: list[Path]) -> int:
@@ -68,9 +73,8 @@ def main(folders: list[Path]) -> int:
             rows = [table.loc[place] for table in tables if place in table.index]
             spreads.append(np.std([row["relative"] for row in rows], ddof=1))
             cells = [
-                OBJECTS[place[0]],
-                display_name(trained_on(place[1])),
-                *map(display_name, place[2:]),
+                *place_names(place[:3]),
+                display_name(place[3]),
                 *(f"{signed(row['relative'])} %{MARKS[row['verdict']]}" for row in rows),
                 f"{spreads[-1]:.0f}",
             ]
@@ -81,36 +85,74 @@ def main(folders: list[Path]) -> int:
 
 def summary(found: list[tuple[dict[str, str], pd.DataFrame, pd.DataFrame]]) -> None:
     """Print mean Chamfer distances over the runs, and what every one of them says of the priors."""
-    places = ["objects", "dataset", "backbone"]
     clean = [metrics[metrics["condition"] == CLEAN] for _, metrics, _ in found]
-    means = [x.groupby([*places, "method"])["cd"].mean().unstack("method") * 1e4 for x in clean]
-    every = pd.concat(means).groupby(level=places, sort=False)
+    means = [x.groupby([*PLACE, "method"])["cd"].mean().unstack("method") * 1e4 for x in clean]
+    middle = pd.concat(means).groupby(level=PLACE, sort=False).mean()
     verdicts = pd.concat([table[table["condition"] == CLEAN] for _, _, table in found])
-    said = verdicts.groupby([*places, "method"])["verdict"].agg(set)
-    order = [name for name in METHODS if name in means[0]]
-    print(f"| objects | dataset | backbone | {' | '.join(map(display_name, order))} |")
-    print(f"|{'---|' * (3 + len(order))}")
-    low, middle, high = every.min(), every.mean(), every.max()
+    said = verdicts.groupby([*PLACE, "method"])[["relative", "verdict"]].agg(list)
+    order = [name for name in METHODS if name in middle]
+    heading("| objects | dataset | backbone |", map(display_name, order))
     for place in means[0].index:
         cells = []
         for name in order:
-            if np.isnan(middle.loc[place, name]):
+            mean = middle.loc[place, name]
+            if np.isnan(mean):
+                cells.append("–")
+            elif (*place, name) not in said.index:
+                cells.append(f"{mean:.1f}")
+            else:
+                percent, words = said.loc[(*place, name)]
+                agreed = "" if len(set(words)) == 1 else ", undecided"
+                agreed = ", undecided" if set(words) == {"undecided"} else agreed
+                cells.append(f"{mean:.1f} ({ends(percent)} %{agreed})")
+        print(f"| {' | '.join([*place_names(place), *cells])} |")
+    print(
+        "\nMean Chamfer distance ×1e-4 over all levels and runs; in brackets the difference to the "
+        "control from run to run,\nundecided unless it is lower in every run, or higher.\n"
+    )
+    levels(clean, order)
+
+
+def levels(clean: list[pd.DataFrame], order: list[str]) -> None:
+    """Print at how many levels the mean of each prior lies below the control's in each run, and
+    by how much their mean over runs lies below Stage 1's."""
+    every = [x.groupby([*PLACE, "method", "level"])["cd"].mean().unstack("method") for x in clean]
+    priors = [name for name in order if name not in (STAGE1, CONTROL)]
+    heading("| objects | dataset | backbone |", map(display_name, priors))
+    for place in dict.fromkeys(x[:3] for x in every[0].index):
+        cells = []
+        for name in priors:
+            rows = [x.loc[place] for x in every]
+            if name not in rows[0] or rows[0][name].isna().all():
                 cells.append("–")
                 continue
-            ends = f"{low.loc[place, name]:.1f}–{high.loc[place, name]:.1f}"
-            words = said.get((*place, name))
-            agreed = "" if words is None else f", {words.pop() if len(words) == 1 else 'undecided'}"
-            cells.append(f"{middle.loc[place, name]:.1f} ({ends}){agreed}")
-        names = [
-            OBJECTS[place[0]],
-            display_name(trained_on(place[1])),
-            display_name(place[2]),
-        ]
-        print(f"| {' | '.join([*names, *cells])} |")
+            below = [int((x[name] < x[CONTROL]).sum()) for x in rows]
+            whole = [x.loc[place].mean() for x in every]
+            gain = np.mean([x[name] for x in whole]) / np.mean([x[STAGE1] for x in whole]) - 1
+            counts = ", ".join(map(str, below))
+            cells.append(f"{counts} of {len(rows[0])}; {signed(100 * gain)} %")
+        print(f"| {' | '.join([*place_names(place), *cells])} |")
     print(
-        "\nMean Chamfer distance ×1e-4 over all levels and runs; in brackets those of single runs."
+        "\nLevels at which the mean lies below the control's, run by run; and the difference of\n"
+        "the mean over levels and runs to that of Stage 1.\n"
     )
-    print("Against the control: lower or higher in every run, or else undecided.\n")
+
+
+def heading(first: str, others: Iterable[str]) -> None:
+    cells = list(others)
+    print(f"{first} {' | '.join(cells)} |")
+    print(f"|{'---|' * (3 + len(cells))}")
+
+
+def place_names(place: tuple[str, str, str]) -> list[str]:
+    return [OBJECTS[place[0]], display_name(trained_on(place[1])), display_name(place[2])]
+
+
+def ends(percent: list[float]) -> str:
+    """The least and the most of differences, in the order of their size."""
+    low, high = min(percent), max(percent)
+    first, last = (low, high) if low > 0 else (high, low)
+    return f"{signed(first)} to {signed(last)}"
 
 
 def signed(percent: float) -> str:

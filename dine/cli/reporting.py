@@ -51,21 +51,29 @@ def diagnose(prior, fields, pairs, facts, seed, out):
 @click.argument("metrics", nargs=-1, required=True, type=IN)
 @click.option(
     "--spread",
-    type=click.FloatRange(0),
+    type=click.FloatRange(0, 1),
     default=default_of(config.Evaluation, "training_spread"),
     help="How much differences vary with the training (`evaluation.training_spread`).",
 )
+@click.option(
+    "--spread-outliers",
+    type=click.FloatRange(0, 1),
+    default=default_of(config.Evaluation, "training_spread_outliers"),
+    help="The same on targets with outliers (`evaluation.training_spread_outliers`).",
+)
 @out_option("Folder for CSV, Markdown and LaTeX.", OUT_FOLDER)
-def tables(metrics, spread, out):
+def tables(metrics, spread, spread_outliers, out):
     """Aggregate metrics into the paper's tables and their companions.
 
     Example: dine tables a/metrics.csv b/metrics.csv --out tables
     """
+    from dine.evaluation.statistics import spread_of
     from dine.reporting.loading import load_metrics
     from dine.reporting.table import write_tables
     from dine.reporting.tables import all_tables
 
-    made = all_tables(load_metrics(metrics), spread)
+    chance = config.Evaluation(training_spread=spread, training_spread_outliers=spread_outliers)
+    made = all_tables(load_metrics(metrics), spread_of(chance))
     write_tables(made, out)
 
 

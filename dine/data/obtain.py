@@ -85,7 +85,10 @@ def obtain(
 
 def _content(place: Path, origin: str) -> str:
     """What tells files that were found, or made, from others."""
-    return folder_signature(place) if origin == PATH else file_digest(place / "provenance.json")
+    if origin == PATH:
+        return folder_signature(place)
+    record = place / "provenance.json"
+    return file_digest(record) if record.is_file() else ""
 
 
 def _published(dataset: Dataset, seed: int) -> Deformations:
@@ -128,10 +131,21 @@ def write_inventory(inventory: Inventory, folder: Path) -> None:
 
 
 def obtained(raw: Path) -> tuple[Inventory, str]:
-    """The files behind a ``raw.json`` and their origin."""
+    """The files behind a ``raw.json`` and their origin.
+
+    Raises:
+        DataError: damaged, or the files are not those that it was written for.
+    """
     facts = read_json(raw)
-    found = [facts.get(key) for key in ("folder", "origin")] if isinstance(facts, dict) else [None]
+    keys = ("folder", "origin", "content")
+    found = [facts.get(key) for key in keys] if isinstance(facts, dict) else [None]
     if not all(isinstance(value, str) and "\0" not in value for value in found):
         raise DataError(f"{raw} does not say where the files are; run the step `raw` again.")
-    folder, origin = found
-    return scan(folder), origin
+    folder, origin, content = found
+    inventory = scan(folder)
+    # What was downloaded has no record of its own, and nothing else is looked for there.
+    if origin != DOI and _content(Path(folder), origin) != content:
+        raise DataError(
+            f"{folder} holds other files than {raw} was written for; run the step `raw` again."
+        )
+    return inventory, origin

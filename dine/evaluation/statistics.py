@@ -8,15 +8,16 @@ differ by is reported beside. Definitions and sources: docs/reference/metrics.md
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from scipy import stats
 
+from dine.config import Evaluation
 from dine.errors import DataError
 from dine.evaluation.quality import FAILURE
-from dine.results import NO_BACKBONE
+from dine.results import CLEAN, NO_BACKBONE
 
 SUMMARISED = (
     *("cd", "mce", "hd95", "accuracy_2_5", "accuracy_5", "far_points"),
@@ -42,7 +43,23 @@ _NEEDED = ["dataset", "backbone", "method", "seed", *_PAIR, "condition", "corrup
 _DECIMALS = 6
 
 
+Spread = float | Mapping[str, float]
+"""How much differences vary with the training; see :func:`comparisons`."""
+
+
 # ----------------------------------------------------------------------------- small functions
+
+
+def spread_of(settings: Evaluation) -> dict[str, float]:
+    """By condition, as configured."""
+    return {CLEAN: settings.training_spread, "outliers": settings.training_spread_outliers}
+
+
+def spread_under(spread: Spread, condition: str = CLEAN) -> float:
+    """How much differences vary with the training under a condition."""
+    if isinstance(spread, Mapping):
+        return spread.get(condition, spread.get(CLEAN, 0.0))
+    return spread
 
 
 def holm(p: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -414,7 +431,7 @@ def comparisons(
     reference: str,
     values: Sequence[str] = ("cd", "mce"),
     *,
-    spread: float = 0.0,
+    spread: Spread = 0.0,
 ) -> pd.DataFrame:
     """Every method against a reference, within each dataset and backbone, and what follows.
 
@@ -437,7 +454,8 @@ def comparisons(
         reference: the method that the others are compared with.
         values: columns to compare.
         spread: standard deviation, over trainings, of a difference between two methods' means, as
-            a share of the reference's mean.
+            a share of the reference's mean; one for all conditions, or by condition, where that on
+            clean targets (``deformation``) is that of conditions that are not named.
 
     Raises:
         DataError: see :func:`paired`.
@@ -470,10 +488,11 @@ def comparisons(
     )
 
 
-def _interval(table: pd.DataFrame, spread: float) -> tuple[pd.Series, pd.Series]:
+def _interval(table: pd.DataFrame, spread: Spread) -> tuple[pd.Series, pd.Series]:
     """``low`` and ``high`` of :func:`comparisons`."""
     percent = 100 / table["mean_reference"].where(table["mean_reference"] > 0)
-    chance = 1.96 * 100 * spread / np.sqrt(table[["seeds_method", "seeds_reference"]].min(axis=1))
+    share = table["condition"].map(functools.partial(spread_under, spread))
+    chance = 1.96 * 100 * share / np.sqrt(table[["seeds_method", "seeds_reference"]].min(axis=1))
     clusters = table["clusters"].where(table["clusters"] >= FEWEST_CLUSTERS)
     wider = stats.t.ppf(0.975, clusters - 1) / 1.96 * np.sqrt(clusters / (clusters - 1))
     low, high = (

@@ -13,10 +13,10 @@ from dine.config import PriorConfig, check_arguments
 from dine.data.fields import read_fields
 from dine.errors import DataError
 from dine.files import digest, file_digest
-from dine.models.state import check_still_wanted
 from dine.priors import PRIORS
 from dine.priors.likelihood import Unfinished
 from dine.provenance import code_digest
+from dine.state import check_still_wanted
 
 log = logging.getLogger(__name__)
 

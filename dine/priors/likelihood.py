@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LRScheduler
 
-from dine.models.state import Interrupted, StopRequest, load_state, one_writer, save_state
 from dine.progress import Progress
+from dine.state import Interrupted, StopRequest, load_state, one_writer, save_state
 
 log = logging.getLogger(__name__)
 

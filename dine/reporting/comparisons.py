@@ -18,7 +18,7 @@ import pandas as pd
 from dine.config import CONTROL, STAGE1
 from dine.errors import DataError
 from dine.evaluation import statistics
-from dine.evaluation.statistics import NO_BACKBONE
+from dine.evaluation.statistics import NO_BACKBONE, Spread, spread_under
 from dine.reporting import names
 from dine.reporting.loading import origin_of
 from dine.reporting.names import DASH, change, display_name, in_order, rank
@@ -45,7 +45,7 @@ _PLACE = ["dataset", "backbone"]
 
 
 def effects(
-    metrics: pd.DataFrame, reference: str = CONTROL, value: str = "cd", *, spread: float = 0.0
+    metrics: pd.DataFrame, reference: str = CONTROL, value: str = "cd", *, spread: Spread = 0.0
 ) -> pd.DataFrame:
     """Every prior against a reference under each condition, all its levels and strengths together.
 
@@ -83,11 +83,16 @@ def verdict_cells(data: pd.DataFrame, keys: list[str], rows: Iterable[Any]) -> l
     return cells
 
 
-def training_chance(spread: float) -> str:
-    """What an interval holds besides the chance of the pairs; ``spread`` is a share."""
+def training_chance(spread: Spread) -> str:
+    """What an interval holds besides the chance of the pairs; empty if that is nothing."""
+    shares = [spread_under(spread, condition) for condition in (CLEAN, "outliers")]
+    if not any(shares):
+        return ""
+    clean, outliers = (f"{100 * share:g} %" for share in shares)
+    more = "" if clean == outliers else f", with outliers by {outliers}"
     return (
         " It also holds the chance of the training: another seed, or another CPU's rounding, gives "
-        f"another network, whose difference varies by {100 * spread:g} % of the reference "
+        f"another network, whose difference varies by {clean} of the reference{more} "
         "(standard deviation; evaluation.training_spread)."
     )
 
@@ -146,7 +151,7 @@ class EvidenceStatistics:
         methods: Mapping[str, Mapping[str, Any]],
         reference: str = CONTROL,
         aside: Collection[str] = (),
-        spread: float = 0.0,
+        spread: Spread = 0.0,
     ):
         self.metrics = metrics
         self.methods = _known_methods(list(metrics["method"].unique()), methods)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from dine.config import CONTROL, Evaluation
 from dine.errors import DataError
+from dine.evaluation.statistics import spread_of
 from dine.files import read_json
 from dine.provenance import versions
 from dine.reporting.comparisons import LARGE, EvidenceStatistics
@@ -155,7 +156,7 @@ def build_evidence(
     config = config or {}
     settings = config.get("evidence") or {}
     aside = [*(settings.get("backbones") or {}), *(settings.get("test_sets") or {})]
-    spread = (config.get("evaluation") or {}).get("training_spread", Evaluation().training_spread)
+    spread = spread_of(Evaluation.model_validate(config.get("evaluation") or {}))
     metrics = load_metrics(files.metrics)
     # What cannot be used is refused before anything is computed.
     datasets = set(metrics["dataset"])

@@ -131,7 +131,7 @@ def overview_table(evidence: EvidenceStatistics) -> Table:
         f"{reference}, in percent of it, with its 95 % interval, of the pairs drawn by cluster. "
         "Lower or higher: the interval holds no zero. Otherwise the matter is undecided."
     )
-    caption += training_chance(evidence.spread) if evidence.spread else ""
+    caption += training_chance(evidence.spread)
     title = f"Lower or higher than {reference}?"
     return Table("", title, caption, **laid_out(columns), data=evidence.comparisons)
 

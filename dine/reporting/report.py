@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from dine.config import STAGE1, Config
+from dine.evaluation.statistics import Spread, spread_of
 from dine.files import read_json
 from dine.provenance import versions
 from dine.reporting.html import (
@@ -73,7 +74,7 @@ def build_report(results: Path, config: Config, out: Path) -> None:
     searches = [read_json(path) for path in run.searches().values()]
     chosen = list(pictures.pop(LAMBDA_TITLE, {}).values())
     sections = [
-        *result_sections(run.metrics, pictures, config.evaluation.training_spread),
+        *result_sections(run.metrics, pictures, spread_of(config.evaluation)),
         lambda_section(searches, chosen),
         agreement_section(agreement),
         PageSection("how", "How it was made", _made(run, config)),
@@ -84,7 +85,7 @@ def build_report(results: Path, config: Config, out: Path) -> None:
 def result_sections(
     metrics: pd.DataFrame,
     pictures: Mapping[str, Mapping[str, Part]] | None = None,
-    spread: float = 0.0,
+    spread: Spread = 0.0,
 ) -> list[PageSection]:
     """Findings, tables and figures; a figure whose numbers a table holds stands beside it.
 

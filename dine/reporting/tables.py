@@ -17,7 +17,7 @@ import pandas as pd
 
 from dine.config import CONTROL, STAGE1
 from dine.evaluation import statistics
-from dine.evaluation.statistics import comparisons, rounded
+from dine.evaluation.statistics import Spread, comparisons, rounded
 from dine.reporting import names
 from dine.reporting.comparisons import effects, training_chance, verdict_cells
 from dine.reporting.loading import origin_of
@@ -119,7 +119,7 @@ def summary(
     return found.rename(columns=named)[["dataset", *_SETTING, *_SERIES, *named.values()]]
 
 
-def _decided(metrics: pd.DataFrame, value: str, spread: float) -> pd.DataFrame:
+def _decided(metrics: pd.DataFrame, value: str, spread: Spread) -> pd.DataFrame:
     """``comparisons`` with the control: by level on clean targets, pooled on others."""
     levels = metrics["level"].where(metrics["condition"] == CLEAN)
     found = comparisons(metrics.assign(level=levels), CONTROL, (value,), spread=spread)
@@ -127,7 +127,7 @@ def _decided(metrics: pd.DataFrame, value: str, spread: float) -> pd.DataFrame:
 
 
 def _compare(
-    dataset: str, metrics: pd.DataFrame, kind: Kind, reference: pd.DataFrame, spread: float
+    dataset: str, metrics: pd.DataFrame, kind: Kind, reference: pd.DataFrame, spread: Spread
 ) -> pd.DataFrame:
     """Tidy numbers of one dataset: ours and, where ``reference`` has them, the published ones.
 
@@ -158,7 +158,7 @@ def _compare(
     return in_order(data, keys)
 
 
-def gains(metrics: pd.DataFrame, spread: float = 0.0) -> pd.DataFrame:
+def gains(metrics: pd.DataFrame, spread: Spread = 0.0) -> pd.DataFrame:
     """What each prior adds: reductions of the mean Chamfer distance in percent, on shared pairs.
 
     One row per dataset, backbone, prior and setting (deformation by level, corruptions pooled over
@@ -216,7 +216,7 @@ def _gain(before: float, after: float) -> float:
 # ------------------------------------------------------------------------------- findings
 
 
-def findings(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[Table]:
+def findings(metrics: pd.DataFrame, *, spread: Spread = 0.0) -> list[Table]:
     """Verdicts on clean targets, then those under other conditions and by other measures.
 
     Empty where no prior was evaluated beside the control.
@@ -230,7 +230,7 @@ def findings(metrics: pd.DataFrame, *, spread: float = 0.0) -> list[Table]:
         errors[errors["condition"] == CLEAN].assign(measure="mce"),
         first[first["condition"] == CLEAN].assign(measure=STAGE1),
     ]
-    caption = _CAPTION + (training_chance(spread) if spread else "")
+    caption = _CAPTION + training_chance(spread)
     made = [
         ("Does a prior lower the Chamfer distance on clean targets?", caption, clean),
         (
@@ -287,7 +287,7 @@ _CAPTION = (
 # -------------------------------------------------------------------------------- tables
 
 
-def mean_table(kind: str, dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
+def mean_table(kind: str, dataset: str, metrics: pd.DataFrame, spread: Spread = 0.0) -> Table:
     """Means of one of ``KINDS`` by method and setting, with the published ones beneath.
 
     Levels of the run that the paper lacks, and the reverse, both appear.
@@ -324,11 +324,10 @@ def mean_table(kind: str, dataset: str, metrics: pd.DataFrame, spread: float = 0
     )
 
 
-def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Table:
+def gain_table(dataset: str, metrics: pd.DataFrame, spread: Spread = 0.0) -> Table:
     """What does the prior add over longer training? The rows of ``gains`` for one dataset."""
     data = gains(metrics[metrics["dataset"] == dataset], spread)
     data.insert(1, "origin", origin_of(dataset, metrics) or "")
-    chance = f", and of the training, from run to run ± {100 * spread:g} % (standard deviation)"
     rows = data.to_dict("records")
     settings = [_setting_label(row) for row in rows]
     columns: Columns = {
@@ -361,7 +360,7 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
         "Chamfer distance in percent on the pairs that all methods share; negative values are "
         "losses. The control differs from the prior only in λ = 0. The interval is that of the "
         "reduction over the control: of the test pairs, drawn by deformation where the object is "
-        f"known and by object otherwise{chance if spread else ''}. Undecided: it holds zero.",
+        "known and by object otherwise. Undecided: it holds zero." + training_chance(spread),
         **laid_out(columns),
         data=data.rename(
             columns={name: f"{name}_1e-4" for name in data if name.endswith("mean")}
@@ -374,7 +373,7 @@ def gain_table(dataset: str, metrics: pd.DataFrame, spread: float = 0.0) -> Tabl
     )
 
 
-def all_tables(metrics: pd.DataFrame, spread: float = 0.0) -> list[Table]:
+def all_tables(metrics: pd.DataFrame, spread: Spread = 0.0) -> list[Table]:
     """Every table that the metrics have rows for: the paper's first, then the supplementary.
 
     ``spread`` is how much differences vary with the training; see ``statistics.comparisons``.

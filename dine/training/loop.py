@@ -32,9 +32,9 @@ from dine.geometry.chamfer import chamfer_distance
 from dine.geometry.folding import roughness
 from dine.models.backbones import Backbone
 from dine.models.devices import chosen_device, leased
-from dine.models.state import Interrupted, StopRequest, load_state, one_writer, save_state
 from dine.progress import Progress
 from dine.results import Network
+from dine.state import Interrupted, StopRequest, load_state, one_writer, save_state
 from dine.training.objective import Loss, Objective
 from dine.training.parallel import Alone, Team, run_together
 

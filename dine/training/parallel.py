@@ -30,7 +30,7 @@ from torch.multiprocessing import (
 from dine.errors import ConfigError, DineError
 from dine.extras import missing
 from dine.models.devices import leased
-from dine.models.state import Interrupted, StopRequest
+from dine.state import Interrupted, StopRequest
 
 START = "spawn"
 """How processes are started: CUDA does not survive a fork of a process that has used it."""

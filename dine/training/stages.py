@@ -18,9 +18,9 @@ from dine.models.backbones import BACKBONES, Backbone
 from dine.models.checkpoint import load_backbone, save_backbone, shipped_weights
 from dine.models.devices import chosen_device
 from dine.models.inference import COMPUTE
-from dine.models.state import check_still_wanted
 from dine.provenance import code_digest, run_record
 from dine.results import Network
+from dine.state import check_still_wanted
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import Seen, TrainingJob, history_csv, train
 from dine.training.objective import Objective

@@ -46,7 +46,6 @@ from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_moved, write_surface
 from dine.models.checkpoint import load_backbone, save_backbone
-from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior
 from dine.priors.organ import load_organ_prior
 from dine.priors.organ_learning import learn
@@ -58,6 +57,7 @@ from dine.registration.surfaces import ProcessField
 from dine.registration.types import Motion, RegistrationResult, Trust
 from dine.simulation.fields import OrganDeformations, read_deformations, write_deformations
 from dine.simulation.simulate import simulate
+from dine.state import load_state, save_state
 from dine.training.stage2 import selected_lambda
 from dine.training.stages import new_backbone
 from fuzz import mutations as m
@@ -910,7 +910,12 @@ TARGETS: dict[str, Target] = {
         split_file,
     ),
     "split_txt": Target("train.txt", lambda: [b"# names\n12\n13\n"], m.TEXT, split_file),
-    "raw": Target("raw.json", lambda: [b'{"folder": "data", "origin": "path"}'], m.JSON, raw_facts),
+    "raw": Target(
+        "raw.json",
+        lambda: [b'{"folder": "data", "origin": "doi", "content": ""}'],
+        m.JSON,
+        raw_facts,
+    ),
     "provenance": Target("p.json", provenance, m.JSON, made_folder, 0.3),
     "search": Target(
         "search.json",

@@ -34,10 +34,10 @@ from dine.io.announced import RATIO, SMALL
 from dine.io.readers import read_surface
 from dine.models.backbones import BACKBONES
 from dine.models.checkpoint import load_backbone, save_tensors
-from dine.models.state import load_state, save_state
 from dine.priors import PRIORS, load_prior
 from dine.registration.calibration import Calibration, load_calibration
 from dine.registration.many import read_jobs
+from dine.state import load_state, save_state
 from dine.training.stage2 import selected_lambda
 from dine.training.stages import new_backbone
 
@@ -610,7 +610,13 @@ def test_a_folder_by_a_relative_path_finds_its_pairs(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "content", ["[]", '{"folder": [], "origin": "x"}', '{"folder": "a\\u0000"}']
+    "content",
+    [
+        "[]",
+        '{"folder": [], "origin": "x"}',
+        '{"folder": "a\\u0000"}',
+        '{"folder": "a", "origin": "x"}',
+    ],
 )
 def test_a_record_of_raw_files_that_says_nothing(tmp_path, content):
     (tmp_path / "raw.json").write_text(content)

@@ -14,7 +14,7 @@ from test_training import IDENTITY, SETTINGS, Exploding, job, toy_pairs
 
 from dine.errors import ConfigError, DineError
 from dine.models.backbones import Backbone, Registration
-from dine.models.state import Interrupted, load_state, one_writer
+from dine.state import Interrupted, load_state, one_writer
 from dine.training import loop, parallel
 from dine.training.objective import Objective
 

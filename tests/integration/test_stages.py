@@ -30,8 +30,8 @@ from dine.geometry.distance import chamfer
 from dine.geometry.surface import Surface
 from dine.io.writers import write_surface
 from dine.models.inference import predict_fields
-from dine.models.state import one_writer
 from dine.priors import FlowPrior, load_prior
+from dine.state import one_writer
 from dine.training import stages
 from dine.training.data_terms import DATA_TERMS
 from dine.training.loop import VALIDATION_COLUMNS
@@ -584,6 +584,21 @@ def test_a_folder_in_the_published_layout_is_used_as_it_is(chain, tmp_path):
     assert "deformation" in listed
     assert "0.5" in listed
     assert "left out" in listed
+
+
+def test_pairs_are_of_the_files_that_were_found_and_of_no_others(chain, tmp_path):
+    """What changed in a folder after its files were listed is not taken for what was listed."""
+    scans = shutil.copytree(chain / "raw", tmp_path / "scans")
+    source = json.dumps({"source": {"kind": "path", "folder": str(scans)}})
+    dine("raw", "--settings", source, "--out", tmp_path)
+    arguments = ("pairs", "--raw", tmp_path / "raw.json", "--out", tmp_path / "pairs.h5")
+    target = next(scans.rglob("Target_*"))
+    target.rename(tmp_path / "kept.ply")
+    with pytest.raises(DataError, match=r"holds other files than .* run the step `raw` again"):
+        dine(*arguments, "--settings", '{"points": 64}')
+    assert not (tmp_path / "pairs.h5").exists()
+    (tmp_path / "kept.ply").rename(target)
+    dine(*arguments, "--settings", '{"points": 64}')
 
 
 def test_main_prints_one_line_for_a_users_error(capsys, monkeypatch, tmp_path):

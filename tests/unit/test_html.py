@@ -325,6 +325,9 @@ def test_the_page_shows_effects_their_chance_and_where_they_were_made(tmp_path):
     assert "varies by 5 % of the reference" in words
     assert "What Value CPU a <chip>" in words
     assert "varies by" not in Page(page(tmp_path, even(-0.5))).words
+    spread = {"deformation": 0.05, "outliers": 0.3}
+    words = Page(page(tmp_path, even(-0.5), spread=spread)).words
+    assert "varies by 5 % of the reference, with outliers by 30 % (" in words
 
 
 @pytest.mark.parametrize("address", ["https://example.org/x.csv", "//example.org", "/etc/x"])

@@ -14,11 +14,11 @@ from sklearn.covariance import shrunk_covariance
 from dine.config import PriorConfig, check_arguments
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.geometry.graph import neighbour_graph
-from dine.models.state import Interrupted, load_state
 from dine.priors import PRIORS, LatentFlowPrior, likelihood, load_prior
 from dine.priors.gaussian import squared_exponential
 from dine.priors.likelihood import Unfinished
 from dine.priors.sources import SourceCache, held_out_folds, source_labels
+from dine.state import Interrupted, load_state
 
 pytestmark = pytest.mark.numerical
 POINTS = 20

@@ -377,6 +377,20 @@ def test_verdicts_join_the_chance_of_pairs_and_of_training(spread, seeds, verdic
     assert len(found) == 2
 
 
+@pytest.mark.parametrize(
+    ("spread", "half"), [({"deformation": 0.1}, 0.1), ({"deformation": 0.1, "noise": 0.3}, 0.3)]
+)
+def test_the_chance_of_training_may_be_another_under_another_condition(spread, half):
+    clean = comparisons(six_objects(1), "old", ("mce",), spread=0.1)
+    noisy = six_objects(1).assign(condition="noise")
+    both = comparisons(pd.concat([six_objects(1), noisy]), "old", ("mce",), spread=spread)
+    same = comparisons(noisy, "old", ("mce",), spread=half)
+    for name in ("low", "high"):
+        of = {row["condition"]: row[name] for row in both.to_dict("records") if row["level"] == 0.5}
+        assert of["deformation"] == only(clean, level=0.5)[name]
+        assert of["noise"] == only(same, level=0.5)[name]
+
+
 def test_verdicts_turn_with_the_reference_and_need_five_clusters():
     turned = only(comparisons(six_objects(), "new", ("mce",)), level=0.5)
     assert turned["verdict"] == "higher"

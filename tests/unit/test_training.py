@@ -15,8 +15,8 @@ from dine.data.pairs import PairSet
 from dine.errors import ConfigError, DataError, DineError
 from dine.models.backbones import Backbone, Registration
 from dine.models.devices import chosen_device
-from dine.models.state import Interrupted, one_writer
 from dine.priors import PRIORS
+from dine.state import Interrupted, one_writer
 from dine.training import loop
 from dine.training.data_terms import DATA_TERMS
 from dine.training.objective import Objective

@@ -86,6 +86,11 @@ SETTINGS = {
         0.2,
         Counter(tables=1, html=1),
     ),
+    "the same under outliers": (
+        ("evaluation", "training_spread_outliers"),
+        0.2,
+        Counter(tables=1, html=1),
+    ),
     "the index convention": ((*EGGS, "pairs", "convention"), "none", ALL + DATA),
     "another target": (("pretraining", "steps"), 7, Counter(html=1)),
     "threads": (("threads",), 2, Counter(html=1)),

@@ -1,5 +1,6 @@
 """The workflow as a user runs it: one tiny run of everything, then what each change reruns."""
 
+import io
 import json
 import os
 import re
@@ -293,6 +294,31 @@ def test_the_evidence_draws_targets_of_unseen_objects_anew_too(tmp_path):
     (line,) = [line for line in said.splitlines() if " resample " in line]
     assert line.count("--raw ") == 2
     assert "mine/unseen/raw.json" in line
+
+
+@pytest.mark.parametrize(
+    "rule", ["pairs", "resample", "search_lambda", "tables", "figures", "html"]
+)
+def test_a_step_finds_all_that_it_reads_among_its_inputs(finished, tmp_path, rule):
+    """Run where nothing else is: what it is given to look for files in holds its inputs alone."""
+    said = snakemake(finished, "all", *FINISHED, "--detailed-summary").stdout
+    jobs = pd.read_csv(io.StringIO(said), sep="\t").set_index("rule").loc[[rule]]
+    inputs, command = jobs.iloc[0][["input-file(s)", "shellcmd"]]
+    for name in inputs.split(","):
+        copy = tmp_path / name
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(finished / name, copy)
+    # The meshes lie where the record of them says, which may be anywhere.
+    for folder in Path(finished).glob(f"{RESULTS}/*/**/raw"):
+        shutil.copytree(folder, tmp_path / folder.relative_to(finished))
+    wanted = jobs[jobs["shellcmd"] == command]["output_file"]
+    for name in wanted:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    done = subprocess.run(
+        command, shell=True, cwd=tmp_path, env=os.environ | warm(), capture_output=True, text=True
+    )
+    assert not done.returncode, done.stderr
+    assert all((tmp_path / name).is_file() for name in wanted)
 
 
 def test_a_finished_model_is_restored_bit_for_bit(finished):

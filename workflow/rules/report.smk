@@ -30,9 +30,11 @@ rule tables:
         **request("reporting"),
     params:
         spread=CONFIG.evaluation.training_spread,
+        spread_outliers=CONFIG.evaluation.training_spread_outliers,
         code=code_digest("tables"),
     shell:
         "dine --log {log:q} tables {input:q} --spread {params.spread}"
+        " --spread-outliers {params.spread_outliers}"
         ' --out "$(dirname -- {output.all:q})"'
 
 
@@ -147,9 +149,11 @@ for PRIOR in CONFIG.priors:
             **request("reporting"),
         params:
             spread=CONFIG.evaluation.training_spread,
+            spread_outliers=CONFIG.evaluation.training_spread_outliers,
             code=code_digest("tables"),
         shell:
             "dine --log {log:q} tables {input:q} --spread {params.spread}"
+            " --spread-outliers {params.spread_outliers}"
             ' --out "$(dirname -- {output:q})"'
 
 
