@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +34,18 @@ KEYS = [*PLACE, "method"]
 MARKS = {"lower": "", "higher": " (higher)", "undecided": " (undecided)"}
 
 
-def read(folder: Path) -> tuple[dict[str, str], pd.DataFrame, pd.DataFrame]:
-    """How a run was made, its metrics and its effects on clean targets."""
+@dataclass(frozen=True)
+class Finished:
+    """A run: how it was made, its metrics, and the effects of its priors against the control, and
+    against the better of control and Stage 1: a control may be worse than what it started from."""
+
+    made: dict[str, str]
+    metrics: pd.DataFrame
+    control: pd.DataFrame
+    both: pd.DataFrame
+
+
+def read(folder: Path) -> Finished:
     settings = dine_config.load(folder / "config.yaml")
     files = Results(folder)
     every = runs(settings)
@@ -44,7 +55,20 @@ def read(folder: Path) -> tuple[dict[str, str], pd.DataFrame, pd.DataFrame]:
     made["λ"] = ", ".join(
         f"{name} {value:g}" for name, value in read_json(files.search)["selected"].items()
     )
-    return made, metrics, effects(metrics, spread=spread_of(settings.evaluation))
+    spread = spread_of(settings.evaluation)
+    control, first = (effects(metrics, reference, spread=spread) for reference in (CONTROL, STAGE1))
+    return Finished(made, metrics, control, against_both(control, first))
+
+
+def against_both(control: pd.DataFrame, first: pd.DataFrame) -> pd.DataFrame:
+    """The smaller of the gains over two references, decided where both are."""
+    keys = [*KEYS, "condition"]
+    pair = control.merge(first, on=keys, suffixes=("", "_first"))
+    same = pair["verdict"] == pair["verdict_first"]
+    return pair[keys].assign(
+        relative=pair[["relative", "relative_first"]].max(axis=1),
+        verdict=pair["verdict"].where(same, "undecided"),
+    )
 
 
 def main(folders: list[Path]) -> int:
@@ -52,16 +76,17 @@ def main(folders: list[Path]) -> int:
         sys.exit("Give the results folders of at least two runs.")
     found = [read(folder) for folder in folders]
     print("| run | seed | CPU | CPU settings | commit | date | λ |\n|---|---|---|---|---|---|---|")
-    for number, (made, _, _) in enumerate(found, start=1):
+    for number, run in enumerate(found, start=1):
         cells = [
-            made.get(key, "–") for key in ("seed", "CPU", "CPU settings", "commit", "date", "λ")
+            run.made.get(key, "–") for key in ("seed", "CPU", "CPU settings", "commit", "date", "λ")
         ]
         print(f"| {number} | {' | '.join(cells)} |")
     print()
-    summary(found)
+    summary([run.metrics for run in found], [run.both for run in found])
+    controls = [run.control for run in found]
     numbers = range(1, len(found) + 1)
     for condition in (CLEAN, "outliers", "noise", "resampled"):
-        tables = [table[table["condition"] == condition].set_index(KEYS) for _, _, table in found]
+        tables = [table[table["condition"] == condition].set_index(KEYS) for table in controls]
         places = tables[0].index
         if not len(places):
             continue
@@ -80,15 +105,15 @@ def main(folders: list[Path]) -> int:
             ]
             print(f"| {' | '.join(cells)} |")
         print(f"\nStandard deviation over runs, root mean square: {rms(spreads):.0f} %\n")
-    return contradictions([table for _, _, table in found])
+    return contradictions(controls)
 
 
-def summary(found: list[tuple[dict[str, str], pd.DataFrame, pd.DataFrame]]) -> None:
+def summary(metrics: list[pd.DataFrame], both: list[pd.DataFrame]) -> None:
     """Print mean Chamfer distances over the runs, and what every one of them says of the priors."""
-    clean = [metrics[metrics["condition"] == CLEAN] for _, metrics, _ in found]
+    clean = [x[x["condition"] == CLEAN] for x in metrics]
     means = [x.groupby([*PLACE, "method"])["cd"].mean().unstack("method") * 1e4 for x in clean]
     middle = pd.concat(means).groupby(level=PLACE, sort=False).mean()
-    verdicts = pd.concat([table[table["condition"] == CLEAN] for _, _, table in found])
+    verdicts = pd.concat([table[table["condition"] == CLEAN] for table in both])
     said = verdicts.groupby([*PLACE, "method"])[["relative", "verdict"]].agg(list)
     order = [name for name in METHODS if name in middle]
     heading("| objects | dataset | backbone |", map(display_name, order))
@@ -108,14 +133,15 @@ def summary(found: list[tuple[dict[str, str], pd.DataFrame, pd.DataFrame]]) -> N
         print(f"| {' | '.join([*place_names(place), *cells])} |")
     print(
         "\nMean Chamfer distance ×1e-4 over all levels and runs; in brackets the difference to the "
-        "control from run to run,\nundecided unless it is lower in every run, or higher.\n"
+        "better of Stage 1 and control\nfrom run to run, undecided unless it is lower than both in "
+        "every run, or higher.\n"
     )
     levels(clean, order)
 
 
 def levels(clean: list[pd.DataFrame], order: list[str]) -> None:
-    """Print at how many levels the mean of each prior lies below the control's in each run, and
-    by how much their mean over runs lies below Stage 1's."""
+    """Print at how many levels the mean of each prior lies below that of Stage 1 and of the control
+    in each run, and by how much their mean over runs lies below Stage 1's."""
     every = [x.groupby([*PLACE, "method", "level"])["cd"].mean().unstack("method") for x in clean]
     priors = [name for name in order if name not in (STAGE1, CONTROL)]
     heading("| objects | dataset | backbone |", map(display_name, priors))
@@ -126,14 +152,15 @@ def levels(clean: list[pd.DataFrame], order: list[str]) -> None:
             if name not in rows[0] or rows[0][name].isna().all():
                 cells.append("–")
                 continue
-            below = [int((x[name] < x[CONTROL]).sum()) for x in rows]
+            better = [x[[STAGE1, CONTROL]].min(axis=1) for x in rows]
+            below = [int((x[name] < y).sum()) for x, y in zip(rows, better, strict=True)]
             whole = [x.loc[place].mean() for x in every]
             gain = np.mean([x[name] for x in whole]) / np.mean([x[STAGE1] for x in whole]) - 1
             counts = ", ".join(map(str, below))
             cells.append(f"{counts} of {len(rows[0])}; {signed(100 * gain)} %")
         print(f"| {' | '.join([*place_names(place), *cells])} |")
     print(
-        "\nLevels at which the mean lies below the control's, run by run; and the difference of\n"
+        "\nLevels at which the mean lies below both others, run by run; and the difference of\n"
         "the mean over levels and runs to that of Stage 1.\n"
     )
 

@@ -8,6 +8,7 @@ differ by is reported beside. Definitions and sources: docs/reference/metrics.md
 from __future__ import annotations
 
 import functools
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -323,6 +324,8 @@ def _tidy(metrics: pd.DataFrame, values: Iterable[str]) -> pd.DataFrame:
 def _over_seeds(rows: pd.DataFrame, *values: str) -> pd.DataFrame:
     """Mean over seeds per pair, with ``seeds``, how many there are."""
     keys = [*_GROUP, "method"]
+    if rows["seed"].nunique() == 1:  # no mean to take, and no seed that lacks a pair
+        return rows[[*keys, *_PAIR, *values]].assign(seeds=1)
     grouped = rows.groupby([*keys, *_PAIR], dropna=False, sort=False)
     means = grouped[list(values)].mean().join(grouped["seed"].nunique().rename("seeds"))
     means = means.reset_index()
@@ -552,6 +555,8 @@ def _failures(rows: pd.DataFrame) -> dict[str, float]:
 
 def _seed_spread(rows: pd.DataFrame, value: str) -> dict[tuple, dict[str, float]]:
     """Number of seeds and standard deviation of their means, by group and level."""
+    if rows["seed"].nunique() == 1:
+        return defaultdict(lambda: {"seeds": 1, "seed_sd": float("nan")})
     found = {}
     for extra in (["level"], []):
         means = rows.groupby([*_GROUP, *extra, "seed"], sort=False)[value].mean()

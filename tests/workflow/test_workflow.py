@@ -25,7 +25,7 @@ from dine.data.synthetic import primitive
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_surface
-from dine.results import table_names
+from dine.results import Results, table_names
 
 ROOT = Path(__file__).parents[2]
 TINY = "config/tiny.yaml"
@@ -234,7 +234,9 @@ def test_one_ablation_alone_runs_only_what_it_needs(tmp_path):
 
 def test_the_evidence_is_planned_from_its_config(tmp_path):
     folder = copy_workflow(tmp_path)
-    jobs = planned(folder, "evidence", "--configfile", TINY)
+    seeds = folder / "seeds.yaml"
+    seeds.write_text("evidence: {seeds: [0, 1]}")
+    jobs = planned(folder, "evidence", "--configfile", TINY, seeds)
     # Two seeds of three networks; a group of methods without a backbone for each dataset.
     assert jobs["stage1"] == jobs["stage2_control"] == 6
     assert jobs["evidence_evaluate"] == 8
@@ -250,6 +252,27 @@ def test_the_evidence_is_planned_from_its_config(tmp_path):
     assert fewer["stage1"] == 3
     assert fewer["evidence_classical"] == 2
     assert fewer["evidence_refine"] < jobs["evidence_refine"]
+
+
+def test_the_evidence_joins_its_seeds(finished, tmp_path):
+    """On top of what `all` has made with the first one; fewer methods than in the tiny run."""
+    folder = Path(shutil.copytree(finished, tmp_path / "evidence", symlinks=True))
+    changes = folder / "seeds.yaml"
+    changes.write_text(
+        "backbones: {deftransnet: null}\n"
+        "evidence: {seeds: [0, 1], only: [unregistered, map], first_seed_only: [pca_residual]}\n"
+    )
+    snakemake(folder, "evidence", "--configfile", TINY, changes)
+    table = pd.read_csv(Results(folder / RESULTS).evidence.folder / "tables" / "comparisons.csv")
+    table = table[table["backbone"] == "robust_defreg"]
+    counts = table[["method", "seeds_method", "seeds_reference"]].drop_duplicates()
+    assert sorted(counts.itertuples(index=False, name=None)) == [
+        ("map", 2, 2),
+        ("pca", 2, 2),
+        ("pca_residual", 1, 1),
+        ("stage1", 2, 2),
+        ("unregistered", 1, 2),
+    ]
 
 
 def test_searches_of_lambda_get_the_files_of_the_priors_that_they_name(tmp_path):
@@ -314,8 +337,10 @@ def test_a_step_finds_all_that_it_reads_among_its_inputs(finished, tmp_path, rul
     wanted = jobs[jobs["shellcmd"] == command]["output_file"]
     for name in wanted:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    environment = os.environ | warm() | {"PATH": path}
     done = subprocess.run(
-        command, shell=True, cwd=tmp_path, env=os.environ | warm(), capture_output=True, text=True
+        command, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True
     )
     assert not done.returncode, done.stderr
     assert all((tmp_path / name).is_file() for name in wanted)
