@@ -460,6 +460,9 @@ class Training(Section):
     """Steps between validations on `validation_pairs`."""
     validation_pairs: Count = 16
     """Validation pairs, spread evenly over the split."""
+    keep: Literal["last", "best"] = "last"
+    """Weights that a training ends with: the last ones, or `best`, those with the lowest Chamfer
+    distance in a validation, of which the start has one, too (early stopping)."""
     save_seconds: Positive = 20.0
     """Longest time between two saved training states."""
     parts: Annotated[float, Field(ge=0, le=1)] = 0.0

@@ -44,6 +44,8 @@ STATE = "state.pt"
 MEASURED = ("loss", "data", "penalty", "grad_norm")
 HISTORY_COLUMNS = ("step", *MEASURED, "learning_rate", "seconds")
 VALIDATION_COLUMNS = ("val_cd", "val_mce", "val_roughness")
+KEPT = "kept_step"
+"""In the last row of the history: the step whose weights are kept, where these are the best."""
 
 
 def order_of(step: int, batch_size: int, count: int, seed: int) -> np.ndarray:
@@ -105,7 +107,8 @@ def validation_errors(backbone: Backbone, batches: Batches, wanted: int) -> dict
 def history_csv(history: list[dict[str, Any]]) -> str:
     """The history as CSV text."""
     stream = io.StringIO()
-    writer = csv.DictWriter(stream, [*HISTORY_COLUMNS, *VALIDATION_COLUMNS], lineterminator="\n")
+    columns = [*HISTORY_COLUMNS, *VALIDATION_COLUMNS, KEPT]
+    writer = csv.DictWriter(stream, columns, lineterminator="\n")
     writer.writeheader()
     for row in history:
         writer.writerow(
@@ -175,7 +178,8 @@ def train(
 
     Returns:
         One row per step: step, loss, data, penalty, gradient norm, learning rate, seconds; every
-        validation adds ``val_cd`` and ``val_mce`` to its row.
+        validation adds ``val_cd`` and ``val_mce`` to its row; the last has ``kept_step``, the step
+        whose weights are kept, if these are the best.
 
     Raises:
         Interrupted: SIGTERM or SIGINT came; the state is saved.
@@ -227,6 +231,8 @@ class _Trainer:
     def __init__(self, team: Team, backbone: Backbone, job: TrainingJob):
         self.team, self.backbone, self.job = team, backbone, job
         self.history: list[dict[str, Any]] = []
+        self.best: dict[str, Any] | None = None
+        """Step, error and weights of the best validation, where those are kept."""
         backbone.to(team.device).train()
         if job.objective.prior is not None:
             job.objective.prior.to(team.device)
@@ -245,7 +251,7 @@ class _Trainer:
             return 0
         self.backbone.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.history = state["history"]
+        self.history, self.best = state["history"], state["best"]
         return state["step"]
 
     def save(self, step: int) -> None:
@@ -258,6 +264,7 @@ class _Trainer:
                 "model": self.backbone.state_dict(),
                 "optimiser": self.optimiser.state_dict(),
                 "history": self.history,
+                "best": self.best,
             },
         )
         write_text(Network(self.job.folder).history, history_csv(self.history))
@@ -280,6 +287,8 @@ class _Trainer:
             contextlib.closing(stream),
             Progress(job.name, settings.steps, start, quiet=not team.leads) as progress,
         ):
+            if team.leads and start == 0 and settings.keep == "best":
+                self._validated(0, validated)
             for step, (batch, truth) in zip(steps, stream, strict=True):
                 row = self._step(step, loss_of, batch, truth)
                 row["seconds"] = time.monotonic() - began
@@ -287,14 +296,15 @@ class _Trainer:
                 last = step + 1 == settings.steps
                 if team.leads:
                     if last or (step + 1) % settings.validate_every == 0:
-                        row |= validation_errors(
-                            self.backbone, validated, settings.validation_pairs
-                        )
+                        row |= self._validated(step + 1, validated)
                     progress.update(1, loss=np.mean([r["loss"] for r in self.history[-50:]]))
                     if on_step is not None:
                         on_step(step)
                 stopping = team.stopping
                 late = time.monotonic() - saved > settings.save_seconds
+                if team.leads and last and self.best is not None:
+                    row[KEPT] = self.best["step"]
+                    self.backbone.load_state_dict(self.best["model"])
                 if team.leads and (last or late or stopping):
                     self.save(step + 1)
                     saved = time.monotonic()
@@ -304,6 +314,17 @@ class _Trainer:
                         f"{job.name} was stopped after step {step + 1} of {settings.steps}; run "
                         "the same command again to go on from there."
                     )
+
+    def _validated(self, step: int, validated: Batches) -> dict[str, float]:
+        """Errors after so many steps, whose weights are remembered if they are the best so far."""
+        settings = self.job.settings
+        found = validation_errors(self.backbone, validated, settings.validation_pairs)
+        if settings.keep == "best" and not (
+            self.best is not None and self.best["val_cd"] <= found["val_cd"]
+        ):
+            model = {name: x.detach().clone() for name, x in self.backbone.state_dict().items()}
+            self.best = {"step": step, "val_cd": found["val_cd"], "model": model}
+        return found
 
     def _step(
         self, step: int, loss_of: Callable[..., tuple[Tensor, ...]], batch: Batch, truth: Tensor

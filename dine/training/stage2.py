@@ -121,13 +121,17 @@ def search_lambda(
 
 
 def _shortened(stage: Stage2, search: LambdaSearch) -> Stage2:
-    """Stage 2 of a candidate: one validation, at the end, on more pairs than training looks at."""
+    """Stage 2 of a candidate: one validation, at the end, on more pairs than training looks at.
+
+    Its last weights are kept, since candidates that all end where they began differ in nothing.
+    """
     return stage.model_copy(
         update={
             "steps": search.steps,
             "warmup": round(stage.warmup * search.steps / stage.steps),
             "validate_every": search.steps,
             "validation_pairs": search.validation_pairs,
+            "keep": "last",
         }
     )
 

@@ -165,6 +165,60 @@ def test_a_finished_run_is_not_trained_again(tmp_path):
     assert same(weights, expected)
 
 
+def scripted(monkeypatch, errors):
+    """Validations that find these errors, one after the other."""
+    found = iter(errors)
+    monkeypatch.setattr(loop, "validation_errors", lambda *_: {"val_cd": next(found)})
+
+
+BEST = SETTINGS.model_copy(update={"validate_every": 2, "schedule": "constant", "keep": "best"})
+
+
+@pytest.mark.parametrize(
+    ("errors", "kept"),
+    [([3, 2, 1, 1], 4), ([3, 1, 2, 2], 2), ([1, 2, 3, 2], 0), ([3, 2, 2, 1], 6)],
+)
+def test_the_best_weights_are_kept_those_of_the_start_among_them(
+    tmp_path, monkeypatch, errors, kept
+):
+    scripted(monkeypatch, errors)
+    found, history = run(tmp_path / "best", settings=BEST)
+    assert history[-1]["kept_step"] == kept
+    assert [row["val_cd"] for row in history if "val_cd" in row] == errors[1:]
+    if kept:
+        monkeypatch.undo()
+        expected, shorter = run(
+            tmp_path / "shorter", steps=kept, settings=BEST.model_copy(update={"keep": "last"})
+        )
+        assert "kept_step" not in shorter[-1]
+    else:
+        arguments = {"candidates": 16, "initialisation": "default"}
+        expected = new_backbone("robust_defreg", arguments, seed=0).state_dict()
+    assert same(found, expected)
+    # Found finished, it is what it was.
+    again, _ = run(tmp_path / "best", settings=BEST)
+    assert same(again, expected)
+
+
+@pytest.mark.parametrize("at", [0, 1, 4])
+def test_the_best_weights_survive_a_kill(tmp_path, monkeypatch, at):
+    def kill(step):
+        if step == at:
+            raise Killed
+
+    scripted(monkeypatch, [3, 1, 2, 2])
+    expected, _ = run(tmp_path / "whole", settings=BEST)
+    errors = {0: 3, 2: 1, 4: 2, 6: 2}
+    done = [step for step in errors if step <= at] if at else []  # at 0 nothing is saved yet
+    scripted(monkeypatch, errors.values())
+    with pytest.raises(Killed):
+        run(tmp_path / "killed", on_step=kill, settings=BEST)
+    scripted(monkeypatch, [error for step, error in errors.items() if step not in done])
+    found, history = run(tmp_path / "killed", settings=BEST)
+    assert history[-1]["kept_step"] == 2
+    assert same(found, expected)
+
+
 @pytest.mark.parametrize("key", IDENTITY)
 def test_a_state_of_another_run_is_not_used(tmp_path, key, caplog):
     run(tmp_path, steps=3)
