@@ -12,6 +12,7 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import h5py
@@ -90,9 +91,13 @@ class OrganPrior:
 
     def at(self, carrier: csr_matrix) -> tuple[np.ndarray, np.ndarray]:
         """Mean (N, 3) and modes (R, N, 3) at some places."""
-        flat = carrier @ self.modes.swapaxes(0, 1).reshape(len(self.mean), -1)
-        modes = flat.reshape(carrier.shape[0], len(self.modes), 3).swapaxes(0, 1)
-        return carrier @ self.mean, np.ascontiguousarray(modes)
+        modes = (carrier @ self._by_site).reshape(carrier.shape[0], len(self.modes), 3)
+        return carrier @ self.mean, np.ascontiguousarray(modes.swapaxes(0, 1))
+
+    @cached_property
+    def _by_site(self) -> np.ndarray:
+        """(V + n, 3R), the modes as a sparse matrix multiplies them."""
+        return self.modes.swapaxes(0, 1).reshape(len(self.mean), -1)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the prior atomically (HDF5)."""

@@ -63,6 +63,9 @@ class SurfaceOptions:
         parts: each scan shows what the other does not. Where one was cut the other goes on, so rims
             do not belong on rims, and a match must be the nearest from both sides, roughly: what
             only one shows would find something of the other wherever that ends.
+        tried_modes: while several fields are tried so many of the prior's modes are used, the first
+            ones; None for all.
+        tried_columns: likewise of its kernel's columns.
     """
 
     firsts: tuple[float, ...] = (0.08, 0.2)
@@ -79,6 +82,8 @@ class SurfaceOptions:
     source_looks: bool = True
     target_looks: bool = True
     parts: bool = False
+    tried_modes: int | None = None
+    tried_columns: int = 150
 
     @property
     def both_look(self) -> bool:
@@ -88,8 +93,8 @@ class SurfaceOptions:
 
 DEFAULTS = SurfaceOptions()
 # While several fields are tried: points of the source, of the target and of those that look for the
-# source, columns of the prior's kernel. Of the one that goes on so many look.
-_FEWER_POINTS, _FEWER_TARGETS, _FEWER_LOOKING, _FEWER_COLUMNS = 1000, 5000, 2000, 150
+# source. Of the one that goes on so many look.
+_FEWER_POINTS, _FEWER_TARGETS, _FEWER_LOOKING = 1000, 5000, 2000
 _LOOKING = 8000
 # Points at which the roughness of the target is looked at.
 _ROUGHNESS_POINTS = 4000
@@ -251,7 +256,8 @@ def _fields(
     between: float,
 ) -> Iterator[tuple[np.ndarray, float]]:
     """Fields (N + E + L, 3) down to some standard deviation, on fewer points; their energies."""
-    rank, count = _FEWER_COLUMNS, len(source.surface.points)
+    count, rank = len(source.surface.points), search.options.tried_columns
+    modes = prior.modes[: search.options.tried_modes]
     guided = np.arange(len(source.places), len(prior.mean))
     inside = evenly(source.surface.points, _FEWER_POINTS)
     rim = np.arange(0, len(source.rim.points), 2)
@@ -267,14 +273,14 @@ def _fields(
     few.signs = search.signs
     rows = np.concatenate([inside, count + rim, guided])
     # A pivoted root's first columns are a root of lower rank.
-    less = LinearGaussian(prior.mean[rows], prior.modes[:, rows], prior.kernel[rows, :rank])
+    less = LinearGaussian(prior.mean[rows], modes.take(rows, axis=1), prior.kernel[rows, :rank])
     for first in search.options.firsts:
         schedule = np.geomspace(max(first, between), between, search.options.rounds)
         ends = []
         for start in starts:
             found = few.posterior(start[rows], less, schedule)
             field = prior.mean + prior.kernel[:, :rank] @ found.alone
-            field += np.tensordot(found.shared, prior.modes, axes=1)
+            field += np.tensordot(found.shared, modes, axes=1)
             ends.append(field)
             yield field, found.energy
         apart = np.ptp(ends, axis=0)

@@ -34,7 +34,13 @@ from dine.geometry.surface import Surface
 from dine.geometry.voxels import NodeField, Voxels
 from dine.priors.gaussian import CovarianceRoot, LinearGaussian, Posterior, covariance_root
 from dine.priors.organ import OrganPrior
-from dine.refinement.surface import NO_GUIDES, Outline, SurfaceOptions, refine_on_surface
+from dine.refinement.surface import (
+    NO_GUIDES,
+    Outline,
+    SurfaceOptions,
+    refine_on_surface,
+    spread,
+)
 from dine.registration.assessment import DOUBTFUL, GOOD, IMPLAUSIBLE
 from dine.registration.shapes import check_sizes, check_spaces, checked_landmarks, dense_points
 from dine.registration.surfaces import oriented_points
@@ -46,10 +52,17 @@ _DRAWN = 4
 _RANK, _TOLERANCE = 120, 3e-3
 # Standard deviations of how an organ lies after rigid alignment, radii and radians.
 _SHIFT, _TURN = 0.1, 0.15
-# What finds out how it lies, so many times; then the field.
+# Points of template and scan that are aligned rigidly. Then what finds out how it lies, so many
+# times, on so many points, by so many components, which leave less than the matches are sure of,
+# and columns of the process.
+_ALIGNED = 1000
 _POSE = SurfaceOptions(firsts=(0.1,), between=0.05, last=0.03, rounds=6)
 _POSES = 2
-_FIELD = SurfaceOptions(firsts=(0.08, 0.15), last=0.02, rounds=10)
+_POSE_POINTS, _POSE_TARGETS, _POSE_MODES, _POSE_RANK = 500, 2000, 30, 30
+# Then the field.
+_FIELD = SurfaceOptions(
+    firsts=(0.08, 0.15), last=0.02, rounds=10, tried_modes=6 + _POSE_MODES, tried_columns=_POSE_RANK
+)
 # Share of the vertices that are to lie within their bounds; and how much wider these are than if
 # prior and matches were right, which was chosen on shapes that docs/guide/organ.md does not show.
 BOUND = 0.9
@@ -90,20 +103,29 @@ class Placed:
         return self.alignment.matrix[:3, :3]
 
     def at(self, carrier: csr_matrix, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (N, 3) and modes (R, N, 3) at places (N, 3) that a carrier leads to; the last six
+        """Mean (N, 3) and modes (R, N, 3) at places (N, 3) that a carrier leads to; the first six
         are rigid, if it lies loosely."""
         mean, modes = self.prior.at(carrier)
         mean, modes = mean @ self.rotation.T, modes @ self.rotation.T
-        if not self.loose:
-            return mean, modes
+        return mean, np.concatenate([self._rigid(places), modes]) if self.loose else modes
+
+    def moved(self, carrier: csr_matrix, places: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
+        """Displacement (N, 3) there where the modes have amplitudes (R,)."""
+        rigid, own = np.split(amplitudes, [6 if self.loose else 0])
+        prior = self.prior
+        found = carrier @ (prior.mean + np.tensordot(own, prior.modes, axes=1)) @ self.rotation.T
+        return found + np.tensordot(rigid, self._rigid(places), axes=1) if self.loose else found
+
+    @staticmethod
+    def _rigid(places: np.ndarray) -> np.ndarray:
+        """(6, N, 3) small motions along and about the axes."""
         axes = np.eye(3)[:, None]
         shifts = np.broadcast_to(_SHIFT * axes, (3, *places.shape))
-        turns = _TURN * np.cross(axes, places[None])
-        return mean, np.concatenate([modes, shifts, turns])
+        return np.concatenate([shifts, _TURN * np.cross(axes, places[None])])
 
     def turned(self, posterior: Posterior) -> Placed:
         """Lying as the rigid modes of a posterior say."""
-        shift, turn = _SHIFT * posterior.shared[-6:-3], _TURN * posterior.shared[-3:]
+        shift, turn = _SHIFT * posterior.shared[:3], _TURN * posterior.shared[3:6]
         motion = np.eye(4)
         motion[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
         frame = self.alignment.frame
@@ -130,9 +152,8 @@ class OrganField:
 
     def at(self, carrier: csr_matrix, places: np.ndarray) -> np.ndarray:
         """Displacement (N, 3) at places (N, 3) that a carrier leads to."""
-        mean, modes = self.placed.at(carrier, places)
-        moved = np.tensordot(self.posterior.shared, modes, axes=1)
-        return mean + moved + self.root.at(places) @ self.posterior.alone
+        moved = self.placed.moved(carrier, places, self.posterior.shared)
+        return moved + self.root.field(places, self.posterior.alone)
 
     def covariance(self, carrier: csr_matrix, places: np.ndarray) -> np.ndarray:
         """(N, 3, 3) of it, or more where the organ deformed more than is usual under the prior."""
@@ -228,8 +249,32 @@ class _Search:
         kept = replace(guide, here=places, there=guide.there + places - guide.here)
         return replace(self, guide=kept, guided=carrier)
 
+    def fewer(self) -> _Search:
+        """The same with fewer points of both."""
+        kept = evenly(self.places, _POSE_POINTS)
+        some = spread(len(self.scan.points), _POSE_TARGETS)
+        return replace(
+            self,
+            carrier=self.carrier[kept],
+            places=self.places[kept],
+            normals=self.normals[kept],
+            scan=self.scan.at(some),
+        )
+
+    def posed(self, placed: Placed) -> Placed:
+        """Lying as is found on few points, by the components that deform most."""
+        prior, few = placed.prior, self.fewer()
+        for _ in range(_POSES):
+            less = replace(placed, prior=replace(prior, modes=prior.modes[:_POSE_MODES]))
+            placed = placed.turned(few.found(less, _POSE, rank=_POSE_RANK).posterior)
+        return placed
+
     def found(
-        self, placed: Placed, options: SurfaceOptions, starts: Sequence[Start] = ()
+        self,
+        placed: Placed,
+        options: SurfaceOptions,
+        starts: Sequence[Start] = (),
+        rank: int = _RANK,
     ) -> OrganField:
         """The most probable field, from the prior's mean, and from others too."""
         alignment, prior = placed.alignment, placed.prior
@@ -242,7 +287,7 @@ class _Search:
             guides = self.guide.within(alignment)
             carrier, places = vstack([carrier, self.guided]), np.vstack([places, guides.places])
         root = covariance_root(
-            places, prior.widths, prior.amplitudes, rank=_RANK, tolerance=_TOLERANCE
+            places, prior.widths, prior.amplitudes, rank=rank, tolerance=_TOLERANCE
         )
         mean, modes = placed.at(carrier, places)
         found = refine_on_surface(
@@ -286,8 +331,7 @@ def _most_probable(
     for matrix in matrices:
         placed = Placed.lying(prior, matrix, loose)
         if loose:
-            for _ in range(_POSES):
-                placed = placed.turned(search.found(placed, _POSE).posterior)
+            placed = search.posed(placed)
         found.append(search.found(placed, _FIELD, starts))
     return min(found, key=lambda field: field.improbability)
 
@@ -417,8 +461,14 @@ def _motions(
         raise ConfigError(f"The alignment is {how!r}; expected auto, off or a 4×4 matrix.")
     if settings.guide is not None and settings.guide.tells_rotation:
         return [motion_between(settings.guide.here, settings.guide.there)], True
-    ours, theirs = (dense_points(surface) for surface in (source, target))
-    return rigid_alignments(ours, theirs, partial=settings.partial), True
+    return rough_alignments(source, target, partial=settings.partial), True
+
+
+def rough_alignments(source: Surface, target: Surface, *, partial: bool) -> list[np.ndarray]:
+    """The 4×4 rigid motions that may bring a template onto a scan, roughly: the search for a field
+    mends them."""
+    dense = (dense_points(surface) for surface in (source, target))
+    return rigid_alignments(*(x[evenly(x, _ALIGNED)] for x in dense), partial=partial)
 
 
 def _nearest(places: np.ndarray, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

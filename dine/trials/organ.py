@@ -25,13 +25,19 @@ from dine.classical.methods import CLASSICAL
 from dine.config import OrganTrial, Simulation, TrialMethod
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.oriented import evenly
-from dine.geometry.rigid import motion_between, rigid_alignment, rigid_alignments, transformed
+from dine.geometry.rigid import motion_between, rigid_alignment, transformed
 from dine.geometry.surface import Surface
 from dine.priors.gaussian import LinearGaussian, Posterior, covariance_root
 from dine.priors.organ import OrganPrior
 from dine.progress import Progress
 from dine.refinement.process import SURFACE
-from dine.registration.organ import OrganField, Placed, deviation_and_bound, organ_field
+from dine.registration.organ import (
+    OrganField,
+    Placed,
+    deviation_and_bound,
+    organ_field,
+    rough_alignments,
+)
 from dine.registration.shapes import dense_points
 from dine.simulation.fields import OrganDeformations
 from dine.trials.conditions import of_mechanics, of_size
@@ -187,8 +193,7 @@ def _registered(case: Case, prior: OrganPrior) -> dict[str, float]:
     loose = case.motion is not None
     matrices = [np.eye(4)]
     if loose:
-        ours, theirs = dense_points(case.template), dense_points(case.scan)
-        matrices = rigid_alignments(ours, theirs, partial=True)
+        matrices = rough_alignments(case.template, case.scan, partial=True)
     began = time.process_time()
     field, _ = organ_field(prior, case.scan, matrices, loose=loose, partial=True, seed=0)
     log.debug("%.2f CPU seconds", time.process_time() - began)

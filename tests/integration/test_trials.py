@@ -168,9 +168,27 @@ def test_a_pose_that_is_not_told_is_found(truth, methods):
     assert found["seen"] < 0.6 * still["seen"]
 
 
+def test_places_given_are_a_floor_of_turned_scans_too(truth, methods):
+    """Who is told where seen vertices went finds the pose, and finds the same however it lies."""
+    floor = methods.by_name["places_given"]
+    for number, case in enumerate(seen_of(truth)):
+        lying, found, again = (floor(x) for x in (case, case.turned(number), case.turned(9)))
+        assert found["seen"] < 0.005
+        assert found["hidden"] < 2.5 * lying["hidden"]
+        assert found == pytest.approx(again, abs=1e-3)
+
+
 def test_questions_have_the_conditions_that_they_say(truth):
-    labels = [label for label, _ in asked("seen", truth, held(egg()), FEW)]
-    assert len(labels) == len(set(labels)) == 9
+    seen = dict(asked("seen", truth, held(egg()), FEW))
+    assert len(seen) == 9
+    for label, cases in seen.items():
+        assert [case.motion is not None for case in cases] == 2 * [label.startswith("turned")]
+    shown = [seen[f"{share} % seen"][0].seen.mean() for share in (20, 40, 60, 80, 99)]
+    assert np.allclose(shown, [0.2, 0.4, 0.6, 0.8, 0.99], atol=0.1)
+    for noise in (0, 1, 2):
+        case = seen[f"noise of {noise} %"][0]
+        off = case.scan.vertices - case.truth[case.seen]
+        assert off.std() == pytest.approx(noise / 100, rel=0.1)
     (label, cases), *others = asked("methods", truth, held(egg()), FEW)
     assert label == "40 % seen"
     assert len(cases) == 2
