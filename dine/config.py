@@ -116,6 +116,11 @@ class Elasticity(Section):
     """Largest number of loads at once."""
     width: Range = [0.3, 0.8]
     """Width of loads on a place."""
+    cuts: Annotated[int, Field(ge=0)] = 0
+    """Largest number of cuts in a body, from a place of the surface inwards. Their sides no longer
+    hold each other, so that loads part them."""
+    cut: Range = [0.3, 0.8]
+    """How far a cut goes from that place, inwards and along the surface."""
 
     @model_validator(mode="after")
     def _ordered(self):

@@ -20,6 +20,9 @@ from dine.simulation.elasticity import SoftBody
 
 # How far stiffness is alike, and the number of places that say how it varies.
 _ALIKE, _PLACES = 0.5, 8
+# Share of its stiffness that a cube keeps which a cut goes through. With none its corners, where
+# several such cubes meet, would be held by nothing.
+SEVERED = 0.01
 
 
 @dataclass(frozen=True)
@@ -108,7 +111,29 @@ def drawn_body(
     stiffness = _between(settings.stiffness, 0.5 + 0.5 * np.tanh(near))
     if inclusion is not None:
         stiffness = stiffness * (1 + (harder - 1) * inclusion)
+    if settings.cuts:
+        stiffness = np.where(drawn_cuts(organ, settings, rng), SEVERED, 1.0) * stiffness
     return SoftBody(organ.voxels, stiffness, poisson, organ.nodes_at(fixed))
+
+
+def drawn_cuts(organ: Organ, settings: Simulation, rng: np.random.Generator) -> np.ndarray:
+    """Mask (E,) of the cubes that one cut or some go through.
+
+    Each is the part of a ball about a place of the surface that lies in a plane through the normal
+    there. Cubes that touch it are as wide a gap as the grid knows; they join its sides softly, so
+    that the mesh and its cubes stay as they are.
+    """
+    voxels = organ.voxels
+    severed = np.zeros(len(voxels.cubes), bool)
+    for _ in range(rng.integers(settings.cuts) + 1):
+        place, reach = organ.place(rng), rng.uniform(*settings.cut)
+        inwards = organ.areas[((organ.middles - place) ** 2).sum(axis=1).argmin()]
+        across = np.cross(inwards, rng.normal(size=3))
+        across /= np.linalg.norm(across)
+        offset = voxels.middles - place
+        touched = np.abs(offset @ across) <= voxels.edge / 2 * np.abs(across).sum()
+        severed |= touched & (np.linalg.norm(offset, axis=1) <= reach)
+    return severed
 
 
 def drawn_loads(

@@ -20,6 +20,7 @@ from dine.simulation.fields import (
     template_digest,
     write_deformations,
 )
+from dine.simulation.loads import SEVERED, Organ, drawn_cuts
 from dine.simulation.simulate import simulate
 
 pytestmark = pytest.mark.numerical
@@ -224,6 +225,50 @@ def test_a_stiff_inclusion_is_strained_less():
         singular = np.linalg.svd(spread, compute_uv=False)
         strains.append(np.std(singular / singular.mean(axis=1, keepdims=True)))
     assert strains[1] < 0.5 * strains[0]
+
+
+CUT = FEW.model_copy(update={"cuts": 2, "cut": [0.4, 0.8]})
+
+
+def test_the_sides_of_a_cut_part_under_load():
+    organ = Organ.of(ball(), voxelised(ball(), 0.2))
+    voxels = organ.voxels
+    deep = FEW.model_copy(update={"cuts": 1, "cut": [0.9, 0.9]})
+    severed = drawn_cuts(organ, deep, np.random.default_rng(0))
+    # One disc from the surface inwards, a cube or two thick, and on both sides of it the ball.
+    middle = voxels.middles[severed].mean(axis=0)
+    _, extents, axes = np.linalg.svd(voxels.middles[severed] - middle)
+    assert extents[2] / np.sqrt(severed.sum()) < voxels.edge
+    assert np.linalg.norm(voxels.middles[severed], axis=1).max() > 0.8
+    side = (voxels.nodes - middle) @ axes[2]
+    near = np.linalg.norm(voxels.nodes - middle, axis=1) < 0.5
+    sides = [near & (sign * side > 0.75 * voxels.edge) for sign in (1, -1)]
+    forces = np.zeros((*voxels.nodes.shape, 1))
+    for nodes, sign in zip(sides, (1, -1), strict=True):
+        forces[nodes, :, 0] = sign * 1e-3 * axes[2]
+    fixed = voxels.nodes @ middle < -0.3 * np.linalg.norm(middle)
+    opened = []
+    for kept in (1.0, SEVERED):
+        body = SoftBody(voxels, np.where(severed, kept, 1.0), 0.45, fixed)
+        across = body.linear(forces)[:, :, 0] @ axes[2]
+        opened.append(across[sides[0]].mean() - across[sides[1]].mean())
+    assert opened[1] > 3 * opened[0] > 0
+
+
+def test_cut_bodies_are_drawn_like_others_and_no_cube_is_inside_out():
+    found = simulate(ball(), CUT, seed=1)
+    again = simulate(ball(), CUT.model_copy(update={"fields": 2}), seed=1, workers=2)
+    assert np.array_equal(found.nodes[:2], again.nodes)
+    whole = simulate(ball(), FEW, seed=1)
+    # The same loads on other bodies.
+    apart = np.linalg.norm(found.vertices - whole.vertices, axis=2).mean(axis=1)
+    length = np.linalg.norm(whole.vertices, axis=2).mean(axis=1)
+    assert ((apart > 0.02 * length) & (apart < 1.5 * length)).all()
+    voxels = found.voxels
+    body = SoftBody(voxels, np.ones(len(voxels.cubes)), 0.45, voxels.nodes[:, 0] < 0)
+    for kind in (found, whole):
+        moved = np.moveaxis(kind.nodes / voxels.edge, 0, 2).astype(float)
+        assert not body.inverted(moved).any()
 
 
 def test_finer_cubes_change_the_fields_little():
