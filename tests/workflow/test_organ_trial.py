@@ -1,5 +1,6 @@
 """The target `organ`: what it makes, and what each change of its settings makes again."""
 
+import json
 import os
 import re
 import shutil
@@ -13,6 +14,8 @@ import pytest
 import yaml
 from workplace import ROOT, warm
 
+from dine import config
+from dine.plan import EvidencePlan
 from dine.results import Results
 
 TINY = "config/tiny.yaml"
@@ -79,6 +82,45 @@ def test_a_change_makes_again_what_depends_on_it(finished, change):
     settings, expected = CHANGES[change]
     (finished / "change.yaml").write_text(yaml.safe_dump({"organ": settings}))
     assert planned(finished, "change.yaml") == expected
+
+
+def test_what_was_deleted_is_made_again(finished):
+    """Priors and fields are results as well, though tables are there without them."""
+    trial = Results(finished / "results" / "tiny").trial("scan")
+    for file in (trial.held("patch"), trial.fields("patch"), trial.prior("about")):
+        aside = file.rename(file.with_suffix(".aside"))
+        try:
+            jobs = planned(finished)
+        finally:
+            aside.rename(file)
+        made = {"held_patch": "organ_template", "fields_patch": "organ_fields"}
+        assert made.get(file.stem, "organ_prior") in jobs
+    assert planned(finished) == {}
+
+
+def of_plan(**changes):
+    organ = config.OrganTrial(**changes)
+    return EvidencePlan(config.load("config.yaml", TINY).model_copy(update={"organ": organ}))
+
+
+def test_jobs_are_told_what_they_depend_on_and_no_more(tmp_path, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    usual, fewer = of_plan(), of_plan(compared=["rigid"])
+    other = of_plan(simulation=config.Simulation(edge=0.2))
+    for about in ("seen", "mechanics", "size"):
+        assert json.loads(fewer.organ_trial(about))["compared"] == ["rigid"]
+        assert usual.organ_trial(about) != other.organ_trial(about)
+    assert usual.organ_trial("methods") == fewer.organ_trial("methods")
+    assert usual.organ_truth == other.organ_truth != of_plan(edge=0.2).organ_truth
+    held = {how: json.loads(usual.organ_simulation(how))["fixed"] for how in ("about", "patch")}
+    assert held == {"about": "about", "patch": "exactly"}
+    mesh = tmp_path / "mine.ply"
+    mesh.write_bytes(b"ply")
+    mine = of_plan(templates={"mine": str(mesh)})
+    before = mine.organ_signature("mine")
+    mesh.write_bytes(b"another")
+    assert mine.organ_signature("mine") != before
+    assert usual.organ_signature("scan") == ""
 
 
 def test_meshes_of_ones_own_by_name(finished, tmp_path):
