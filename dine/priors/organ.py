@@ -95,6 +95,13 @@ class OrganPrior:
         return carrier @ self.mean, np.ascontiguousarray(modes.swapaxes(0, 1))
 
     @cached_property
+    def left_after(self) -> np.ndarray:
+        """(R,) root mean square, over the vertices, of what each component and those after it
+        do."""
+        squares = self.modes[:, : len(self.template.vertices)] ** 2
+        return np.sqrt(squares.sum(axis=2).mean(axis=1)[::-1].cumsum()[::-1])
+
+    @cached_property
     def _by_site(self) -> np.ndarray:
         """(V + n, 3R), the modes as a sparse matrix multiplies them."""
         return self.modes.swapaxes(0, 1).reshape(len(self.mean), -1)

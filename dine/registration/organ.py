@@ -53,16 +53,17 @@ _RANK, _TOLERANCE = 120, 3e-3
 # Standard deviations of how an organ lies after rigid alignment, radii and radians.
 _SHIFT, _TURN = 0.1, 0.15
 # Points of template and scan that are aligned rigidly. Then what finds out how it lies, so many
-# times, on so many points, by so many components, which leave less than the matches are sure of,
-# and columns of the process.
+# times, on so many points; then the field.
 _ALIGNED = 1000
 _POSE = SurfaceOptions(firsts=(0.1,), between=0.05, last=0.03, rounds=6)
 _POSES = 2
-_POSE_POINTS, _POSE_TARGETS, _POSE_MODES, _POSE_RANK = 500, 2000, 30, 30
-# Then the field.
-_FIELD = SurfaceOptions(
-    firsts=(0.08, 0.15), last=0.02, rounds=10, tried_modes=6 + _POSE_MODES, tried_columns=_POSE_RANK
-)
+_POSE_POINTS, _POSE_TARGETS = 500, 2000
+_FIELD = SurfaceOptions(firsts=(0.08, 0.15), last=0.02, rounds=10)
+# What is far less than matches are sure of is left out while the pose is looked for and several
+# fields are tried: components that leave so much, but for so many at the least, and all but so many
+# columns of a process that is no larger than this.
+_LEFT, _ROUGH_MODES = 0.005, 30
+_SMALL, _ROUGH_RANK = 0.02, 30
 # Share of the vertices that are to lie within their bounds; and how much wider these are than if
 # prior and matches were right, which was chosen on shapes that docs/guide/organ.md does not show.
 BOUND = 0.9
@@ -264,10 +265,11 @@ class _Search:
     def posed(self, placed: Placed) -> Placed:
         """Lying as is found on few points, by the components that deform most."""
         prior, few = placed.prior, self.fewer()
+        modes, rank = _enough(prior)
+        rough = replace(placed, prior=replace(prior, modes=prior.modes[:modes]))
         for _ in range(_POSES):
-            less = replace(placed, prior=replace(prior, modes=prior.modes[:_POSE_MODES]))
-            placed = placed.turned(few.found(less, _POSE, rank=_POSE_RANK).posterior)
-        return placed
+            rough = rough.turned(few.found(rough, _POSE, rank=rank).posterior)
+        return replace(rough, prior=prior)
 
     def found(
         self,
@@ -290,15 +292,28 @@ class _Search:
             places, prior.widths, prior.amplitudes, rank=rank, tolerance=_TOLERANCE
         )
         mean, modes = placed.at(carrier, places)
+        tried, columns = _enough(prior)
+        options = replace(
+            options,
+            source_looks=not self.partial,
+            tried_modes=tried + (6 if placed.loose else 0),
+            tried_columns=columns,
+        )
         found = refine_on_surface(
             Outline(moving, _NO_RIM),
             Outline(fixed, _NO_RIM),
             [mean, *(start(places) for start in starts)],
             LinearGaussian(mean, modes, root.root),
-            replace(options, source_looks=not self.partial),
+            options,
             guides,
         )
         return OrganField(placed, found.posterior, root, found.improbability)
+
+
+def _enough(prior: OrganPrior) -> tuple[int, int]:
+    """How many components and columns of the process a rough search needs."""
+    modes = max(_ROUGH_MODES, int((prior.left_after > _LEFT).sum()))
+    return modes, _ROUGH_RANK if np.linalg.norm(prior.amplitudes) <= _SMALL else _RANK
 
 
 def organ_field(

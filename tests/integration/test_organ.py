@@ -22,6 +22,7 @@ from dine.io.writers import write_surface
 from dine.priors.gaussian import LinearGaussian, Posterior
 from dine.priors.organ import load_organ_prior
 from dine.priors.organ_learning import components, learn
+from dine.registration import organ as organ_registration
 from dine.registration.organ import deviation_and_bound, organ_field
 from dine.simulation.fields import OrganDeformations, write_deformations
 from dine.simulation.simulate import simulate
@@ -341,6 +342,36 @@ def test_a_whole_scan_is_no_special_case(prior):
     error = np.linalg.norm(result.moved.vertices - truth, axis=1)
     assert error.mean() < 0.01 * prior.frame.scale
     assert result.report["supported"] > 0.95
+
+
+def test_a_field_is_the_sum_of_its_parts(prior):
+    """However it is computed: rigid motions, components and the process."""
+    scan, _ = half(placed(organ().vertices + ways(organ().vertices, [8.0, -5.0, 4.0])))
+    field, _ = organ_field(prior, scan, [TURN], loose=True, partial=True, seed=0)
+    carrier = prior.at_vertices()
+    places = field.placed.alignment.normalise(organ().vertices)
+    mean, modes = field.placed.at(carrier, places)
+    assert len(modes) == 6 + 3
+    found = field.posterior
+    expected = (
+        mean + np.tensordot(found.shared, modes, axes=1) + field.root.at(places) @ found.alone
+    )
+    assert np.abs(found.shared).min() > 0
+    assert np.allclose(field.at(carrier, places), expected, atol=1e-6)
+
+
+def test_all_components_count_though_few_are_tried(prior, monkeypatch):
+    few = replace(prior, modes=prior.modes / 100)
+    assert organ_registration._enough(few) == (30, 30)
+    expected = np.linalg.norm(prior.modes[1:, :642], axis=2) ** 2
+    assert prior.left_after[1] == pytest.approx(np.sqrt(expected.sum(axis=0).mean()))
+    # Large processes, which do what components do elsewhere, are kept.
+    assert organ_registration._enough(replace(prior, amplitudes=[0.1, 0, 0]))[1] > 100
+    monkeypatch.setattr(organ_registration, "_enough", lambda _: (1, 3))
+    truth = organ().vertices + ways(organ().vertices, [4.0, -5.0, 4.0])
+    result = dine.register(organ(), Surface(truth, organ().faces), prior=prior, prealign="off")
+    error = np.linalg.norm(result.moved.vertices - truth, axis=1)
+    assert error.mean() < 0.01 * prior.frame.scale
 
 
 def test_equal_inputs_give_equal_results(prior):
