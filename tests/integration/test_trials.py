@@ -159,6 +159,16 @@ def test_what_was_learned_says_more_of_the_hidden_part_than_smoothness(truth, me
     assert all(0 <= x["within"] <= 1 for found in errors.values() for x in found)
 
 
+def test_rivals_leave_out_what_their_names_do(truth, methods):
+    """Or the comparison would be with something else."""
+    case, prior = seen_of(truth)[0], methods.prior
+    other = Methods(replace(prior, mean=2 * prior.mean, modes=2 * prior.modes[::-1]))
+    wider = Methods(replace(prior, amplitudes=[0.1 + x for x in prior.amplitudes]))
+    for name, changed in (("smooth", other), ("pca", wider)):
+        expected = methods.by_name[name](case)
+        assert changed.by_name[name](case) == pytest.approx(expected, rel=1e-6)
+
+
 def test_a_pose_that_is_not_told_is_found(truth, methods):
     case = seen_of(truth)[1]
     turned = case.turned(1)

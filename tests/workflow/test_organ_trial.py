@@ -84,20 +84,6 @@ def test_a_change_makes_again_what_depends_on_it(finished, change):
     assert planned(finished, "change.yaml") == expected
 
 
-def test_what_was_deleted_is_made_again(finished):
-    """Priors and fields are results as well, though tables are there without them."""
-    trial = Results(finished / "results" / "tiny").trial("scan")
-    for file in (trial.held("patch"), trial.fields("patch"), trial.prior("about")):
-        aside = file.rename(file.with_suffix(".aside"))
-        try:
-            jobs = planned(finished)
-        finally:
-            aside.rename(file)
-        made = {"held_patch": "organ_template", "fields_patch": "organ_fields"}
-        assert made.get(file.stem, "organ_prior") in jobs
-    assert planned(finished) == {}
-
-
 def of_plan(**changes):
     organ = config.OrganTrial(**changes)
     return EvidencePlan(config.load("config.yaml", TINY).model_copy(update={"organ": organ}))
