@@ -138,9 +138,12 @@ overwrite_option = click.option(
 
 
 def _grids(**given):
-    """The grids to write, when it is called: what they are made with is not imported before."""
+    """The grids to write, when it is called, or None where there is nothing of them: what they are
+    made with is not imported before."""
 
     def make():
+        if all(value is None for value in given.values()):
+            return None
         from dine.registration.grid import GridFiles
 
         return GridFiles(**given)
@@ -261,15 +264,16 @@ def register(source, target, further, settings, writing, load_model, grids):
         outputs.check(shapes, view=writing.view, overwrite=writing.overwrite)
         moving, grids = read_surface(source), grids()
         check_holds(writing.out, moving)
-        grids.check(moving, overwrite=writing.overwrite)
+        if grids is not None:
+            grids.check(moving, overwrite=writing.overwrite)
         settings["guide"] = further["guide"] or None
         settings["guide_error"] = further["guide_error"]
         marks = landmarks or None
         result = run(moving, target, **load_model(), apply=shapes, landmarks=marks, **settings)
         stages.begin("writing")
         said = save(result, outputs, applied=shapes, view=writing.view, overwrite=writing.overwrite)
-        said += grids.write(result, overwrite=writing.overwrite)
-    files = outputs.files(view=writing.view) | grids.files
+        said += grids.write(result, overwrite=writing.overwrite) if grids else []
+    files = outputs.files(view=writing.view) | (grids.files if grids else {})
     files |= {"applied": {name: outputs.applied(name, path) for name, path in shapes.items()}}
     lines = [_line(writing.out, result), *(f"  {x}" for x in (*result.trust.reasons, *said))]
     tell(lines, _facts(result, said) | {"files": files}, writing.as_json)
@@ -324,7 +328,7 @@ def apply(result, files, out, suffix, overwrite, as_json, grids):
     grids = grids()
     if files and out is None:
         raise click.UsageError("Missing option '-o' / '--out', the folder of the moved files.")
-    if not (files or grids.files):
+    if not (files or (grids and grids.files)):
         raise click.UsageError("Name FILES to move, or a file for --grid.")
     with Stages() as stages:
         stages.begin("reading")
@@ -333,17 +337,19 @@ def apply(result, files, out, suffix, overwrite, as_json, grids):
         from dine.registration.saved import load_result
 
         found = load_result(result)
-        grids.check(found.source, overwrite=overwrite)
+        if grids is not None:
+            grids.check(found.source, overwrite=overwrite)
         stages.begin("moving")
         moved = list(move_files(found, files, out, suffix=suffix, overwrite=overwrite))
-        notes = grids.write(found, overwrite=overwrite)
+        notes = grids.write(found, overwrite=overwrite) if grids else []
+    further = grids.files if grids else {}
     lines = [line for path, said in moved for line in (str(path), *(f"  {x}" for x in said))]
-    lines += [*map(str, grids.files.values()), *(f"  {x}" for x in notes)]
+    lines += [*map(str, further.values()), *(f"  {x}" for x in notes)]
     facts = [
         {"source": file, "moved": path, "notes": said}
         for file, (path, said) in zip(files, moved, strict=True)
     ]
-    tell(lines, {"files": facts, **grids.files, "notes": notes}, as_json)
+    tell(lines, {"files": facts, **further, "notes": notes}, as_json)
 
 
 def _population(template: Path | None, **options):

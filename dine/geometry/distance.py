@@ -8,17 +8,34 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dine.threads import available
+
+# Fewer places are looked up before threads have begun.
+_WORTH_SHARING = 2000
+
+
+def nearest(
+    tree: cKDTree, places: np.ndarray, k: int | list[int] = 1, within: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances and indices of the points of a tree that are nearest to places (N, d), on the
+    threads there are: (N,) each, or (N, j) where ``k`` lists j ranks.
+
+    Farther than ``within`` nothing is found: infinity, and the number of points as the index.
+    """
+    workers = available() if len(places) >= _WORTH_SHARING else 1
+    return tree.query(places, k, distance_upper_bound=within, workers=workers)
+
 
 def distances(a: np.ndarray, b: np.ndarray | cKDTree) -> np.ndarray:
     """Distance (N,), not squared, of each of (N, 3) points to the nearest of (M, 3), or of those
     in a tree."""
     tree = b if isinstance(b, cKDTree) else cKDTree(b)
-    return tree.query(a)[0]
+    return nearest(tree, a)[0]
 
 
 def spacings(points: np.ndarray) -> np.ndarray:
     """Distance (N,) of each of (N, 3) points to the nearest other one."""
-    return cKDTree(points).query(points, k=[2])[0][:, 0]
+    return nearest(cKDTree(points), points, [2])[0][:, 0]
 
 
 def distance_measures(*directions: np.ndarray) -> dict[str, float]:

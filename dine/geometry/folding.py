@@ -8,6 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from dine.geometry.distance import nearest
+
 _NEIGHBOURS = 12
 _RIDGE = 1e-3
 
@@ -15,7 +17,7 @@ _RIDGE = 1e-3
 def neighbourhoods(points: np.ndarray) -> np.ndarray:
     """Rows (N, k) of the 12 points nearest to each of (N, 3), or of all others where fewer."""
     count = min(_NEIGHBOURS + 1, len(points))
-    return cKDTree(points).query(points, k=[*range(1, count + 1)])[1][:, 1:]
+    return nearest(cKDTree(points), points, [*range(1, count + 1)])[1][:, 1:]
 
 
 def folding(

@@ -13,6 +13,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from dine.geometry.distance import nearest
+
 
 def squared_distances(a: Tensor, b: Tensor) -> Tensor:
     """Squared Euclidean distances, (B, N, C) and (B, M, C) to (B, N, M).
@@ -100,12 +102,7 @@ def _by_tree(
     asked = np.arange(len(query))
     if query_mask is not None:
         asked = asked[query_mask.numpy().ravel()]
-    _, position = cKDTree(tree[rows]).query(
-        query[asked],
-        k=[*range(1, k + 1)],
-        distance_upper_bound=width / 2,
-        workers=torch.get_num_threads(),
-    )
+    _, position = nearest(cKDTree(tree[rows]), query[asked], [*range(1, k + 1)], within=width / 2)
     index = np.zeros((len(query), k), np.int64)
     # A neighbour that is missing has the position one past the last.
     index[asked] = np.append(rows % count, 0)[position]

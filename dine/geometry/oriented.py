@@ -8,6 +8,8 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from dine.geometry.distance import nearest
+
 NEIGHBOURS = 12
 """Points of a cloud that its normals follow from, each included."""
 # Neighbours on the other side of a thin wall do not say how this side lies.
@@ -132,7 +134,7 @@ def _nearest(points: np.ndarray, count: int, at: np.ndarray | slice = _EVERYWHER
     """Indices (M, k) of the points that are nearest to each of some, itself first; k is at most
     N."""
     count = min(count, len(points))
-    return cKDTree(points).query(points[at], k=[*range(1, count + 1)])[1]
+    return nearest(cKDTree(points), points[at], [*range(1, count + 1)])[1]
 
 
 def rim_curve(vertices: np.ndarray, edges: np.ndarray, spacing: float) -> Curve:
@@ -195,7 +197,7 @@ class MovingNormals:
     def __init__(self, oriented: OrientedPoints, neighbours: int = 16, curved: bool = False):
         points, normals = oriented.points, oriented.normals
         count = len(points)
-        near = cKDTree(points).query(points, k=[*range(2, min(neighbours, count - 1) + 2)])[1]
+        near = nearest(cKDTree(points), points, [*range(2, min(neighbours, count - 1) + 2)])[1]
         offset = points[near] - points[:, None]
         same = np.einsum("nkc,nc->nk", normals[near], normals)
         weight = (same > _SAME_SIDE) / np.maximum((offset**2).sum(axis=2), 1e-12)

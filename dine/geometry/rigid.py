@@ -10,8 +10,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dine.errors import DataError
+from dine.geometry.distance import nearest
 from dine.geometry.frame import Frame
 from dine.geometry.oriented import evenly
+from dine.threads import each
 
 # A rigid motion must lower the mean squared distance this much, or deformations of round objects
 # would pass for rotations; so must starts at other rotations, or symmetric objects would be turned.
@@ -135,7 +137,7 @@ def overlapping_alignments(source: np.ndarray, target: np.ndarray) -> list[np.nd
     a, b = (frame.normalise(points) for points in (source, target))
     a, b = (points[evenly(points, _FEWER)] for points in (a, b))
     tree = cKDTree(b)
-    found = [_robust(a, b, tree, start) for start in _robust_starts(a, b)]
+    found = each(lambda start: _robust(a, b, tree, start), _robust_starts(a, b))
     found.sort(key=lambda one: one[0])
     chosen = [np.eye(4)]
     for _, motion in found:
@@ -173,7 +175,7 @@ def _robust(
     """How badly what is found from a start fits, and the 4×4 motion."""
     for reach in np.geomspace(_WIDE, _NARROW, _ROUNDS):
         moved = transformed(a, motion)
-        (there, to), (back, asked) = tree.query(moved), cKDTree(moved).query(b)
+        (there, to), (back, asked) = nearest(tree, moved), nearest(cKDTree(moved), b)
         ours = np.concatenate([np.arange(len(a)), asked])
         theirs = np.concatenate([to, np.arange(len(b))])
         squared = np.concatenate([there, back]) ** 2 / reach**2
@@ -209,30 +211,30 @@ class _ClosestPoints:
     def misfit(self, motion: np.ndarray) -> float:
         """Mean squared distance to the nearest other point after a 4×4 motion."""
         moved = transformed(self.a, motion)
-        there = float((self.tree.query(moved)[0] ** 2).mean())
+        there = float((nearest(self.tree, moved)[0] ** 2).mean())
         if not self.both_ways:
             return there
-        return there + float((cKDTree(moved).query(self.b)[0] ** 2).mean())
+        return there + float((nearest(cKDTree(moved), self.b)[0] ** 2).mean())
 
     def best(
         self, starts: Iterable[np.ndarray], count: int = 1, rounds: int = 60
     ) -> list[tuple[float, np.ndarray]]:
         """Misfits and 4×4 motions that some starts lead to, of those that fit best."""
-        found = [self._improved(start, rounds) for start in starts]
-        found = [(self.misfit(motion), motion) for motion in found]
+        found = each(lambda start: self._improved(start, rounds), starts)
         return sorted(found, key=lambda one: one[0])[:count]
 
-    def _improved(self, motion: np.ndarray, rounds: int) -> np.ndarray:
+    def _improved(self, motion: np.ndarray, rounds: int) -> tuple[float, np.ndarray]:
+        """What a start leads to, and its misfit."""
         before = np.inf
         for _ in range(rounds):
-            closest = self.b[self.tree.query(transformed(self.a, motion))[1]]
+            closest = self.b[nearest(self.tree, transformed(self.a, motion))[1]]
             motion = motion_between(self.a, closest)
             apart = transformed(self.a, motion) - closest
             squared = float((apart**2).sum(axis=1).mean())
             if before - squared < _SETTLED:
                 break
             before = squared
-        return motion
+        return self.misfit(motion), motion
 
 
 def _motions(a: np.ndarray, b: np.ndarray, *, both_ways: bool) -> list[np.ndarray]:

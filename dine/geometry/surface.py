@@ -10,6 +10,9 @@ import numpy as np
 
 from dine.errors import DataError
 
+# What so many faces take stays in cache.
+_ROWS = 16384
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -46,8 +49,8 @@ class Surface:
             )
         if len(vertices) == 0:
             raise DataError(f"{self.name} holds no vertices; expected a mesh or a point cloud.")
-        bad = ~np.isfinite(vertices).all(axis=1)
-        if bad.any():
+        if not np.isfinite(vertices).all():
+            bad = ~np.isfinite(vertices).all(axis=1)
             raise DataError(
                 f"{self.name}: {bad.sum()} of {len(vertices)} vertices are NaN or infinite "
                 f"(first at index {int(bad.argmax())}); repair or remove the file."
@@ -102,11 +105,14 @@ class Surface:
         size = np.ptp(used, axis=0).max()
         # Whole columns: rows of three numbers take NumPy three times as long.
         columns = np.ascontiguousarray(((self.vertices - low) / (size or 1.0)).T)
-        first, *others = (columns[:, corner] for corner in self.faces.T)
-        (a, b, c), (d, e, f) = (other - first for other in others)
-        return np.cumsum(
-            np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
-        )
+        areas = np.empty(len(self.faces))
+        for start in range(0, len(areas), _ROWS):
+            some = slice(start, start + _ROWS)
+            first, *others = (columns[:, corner] for corner in self.faces[some].T.copy())
+            (a, b, c), (d, e, f) = (other - first for other in others)
+            squared = (b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2
+            np.sqrt(squared, out=areas[some])
+        return np.cumsum(areas, out=areas)
 
     @cached_property
     def rim(self) -> np.ndarray:
@@ -133,6 +139,11 @@ class Surface:
 
 def rim_edges(faces: np.ndarray, count: int) -> np.ndarray:
     """(B, 2) vertices, of ``count``, of the edges that only one of the faces (F, 3) has."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    key, times = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
-    return np.column_stack(np.divmod(key[times == 1], count))
+    corners = faces.T.copy()
+    ends = corners, np.roll(corners, -1, axis=0)
+    key = (np.minimum(*ends) * count + np.maximum(*ends)).ravel()
+    key.sort()
+    # Edges of several faces follow each other.
+    other = np.ones(len(key) + 1, bool)
+    other[1:-1] = key[1:] != key[:-1]
+    return np.column_stack(np.divmod(key[other[1:] & other[:-1]], count))

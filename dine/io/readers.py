@@ -22,12 +22,6 @@ import numpy as np
 from dine.errors import DataError
 from dine.geometry.surface import Surface
 from dine.io import announced, text
-from dine.io.brain import AS_TEXT, TRIANGULAR, read_freesurfer, read_gifti
-from dine.io.clouds import read_indices, read_pcd, read_table
-from dine.io.meshes import read_obj, read_off, read_stl
-from dine.io.ply import read_ply
-from dine.io.slicer import read_fcsv, read_mrk
-from dine.io.vtk import read_vtk, read_vtp
 
 _PACKED = b"\x1f\x8b"
 _DECIMAL_COMMA = re.compile(r"could not convert string to float: b?'([-+]?\d+,\d+[^']*)'")
@@ -60,7 +54,7 @@ def read_surface(path: str | os.PathLike) -> Surface:
             raise DataError(f"{path} is empty; expected a mesh or a point cloud, so copy it again.")
         if data.startswith(_PACKED):  # whatever its name says: browsers pack and unpack, too
             data = _unpacked(path, data)
-        binary = suffix in _BINARY or read is read_freesurfer
+        binary = suffix in _BINARY or read is _read_freesurfer
         return read(path, data if binary else text.without_mark(data))
     except DataError:
         raise
@@ -91,10 +85,12 @@ def _other_reader(path: Path, suffix: str) -> Callable[[Path, bytes], Surface]:
     Raises:
         DataError: it is neither.
     """
+    from dine.io.brain import AS_TEXT, TRIANGULAR
+
     with contextlib.suppress(OSError), open(path, "rb") as stream:
         begin = stream.read(len(AS_TEXT))
         if begin.startswith(TRIANGULAR):
-            return read_freesurfer
+            return _read_freesurfer
     from dine.io import scenes
 
     if scenes.reads(suffix):
@@ -118,11 +114,57 @@ def _unpacked(path: Path, data: bytes) -> bytes:
     return found
 
 
-# --- by content -------------------------------------------------------------------------------
+# --- modules of one format each, imported when a file of it is read ---------------------------
+
+
+def _read_ply(path: Path, data: bytes) -> Surface:
+    from dine.io.ply import read_ply
+
+    return read_ply(path, data)
+
+
+def _read_mesh(path: Path, data: bytes) -> Surface:
+    from dine.io import meshes
+
+    readers = {".obj": meshes.read_obj, ".off": meshes.read_off, ".stl": meshes.read_stl}
+    return readers[text.format_suffix(path)](path, data)
+
+
+def _read_table(path: Path, data: bytes) -> Surface:
+    from dine.io.clouds import read_table
+
+    return read_table(path, data)
+
+
+def _read_pcd(path: Path, data: bytes) -> Surface:
+    from dine.io.clouds import read_pcd
+
+    return read_pcd(path, data)
+
+
+def _read_freesurfer(path: Path, data: bytes) -> Surface:
+    from dine.io.brain import read_freesurfer
+
+    return read_freesurfer(path, data)
+
+
+def _read_gifti(path: Path, data: bytes) -> Surface:
+    from dine.io.brain import read_gifti
+
+    return read_gifti(path, data)
+
+
+def _read_slicer(path: Path, data: bytes) -> Surface:
+    from dine.io.slicer import read_fcsv, read_mrk
+
+    read = read_fcsv if text.format_suffix(path) == ".fcsv" else read_mrk
+    return read(path, data)
 
 
 def _read_vtk(path: Path, data: bytes) -> Surface:
     """VTK's data of either form; names of one are given to the other."""
+    from dine.io.vtk import read_vtk, read_vtp
+
     return read_vtp(path, data) if data.lstrip()[:1] == b"<" else read_vtk(path, data)
 
 
@@ -133,13 +175,17 @@ def _read_scene(path: Path, data: bytes) -> Surface:
 
 
 def _read_asc(path: Path, data: bytes) -> Surface:
-    return read_freesurfer(path, data) if data.startswith(AS_TEXT) else read_table(path, data)
+    from dine.io.brain import AS_TEXT
+
+    return (_read_freesurfer if data.startswith(AS_TEXT) else _read_table)(path, data)
 
 
 # --- tables and arrays ------------------------------------------------------------------------
 
 
 def _read_xyz(path: Path, data: bytes) -> Surface:
+    from dine.io.clouds import read_indices, read_table
+
     cloud = read_table(path, data)
     companion = path.with_name(f"{text.format_stem(path)}.triangle")
     if not companion.is_file():
@@ -301,21 +347,18 @@ def _face_indices(path: Path, array: np.ndarray) -> np.ndarray:
 _READERS: dict[str, Callable[[Path, bytes], Surface]] = {
     ".glb": _read_scene,
     ".gltf": _read_scene,
-    ".obj": read_obj,
-    ".off": read_off,
-    ".ply": read_ply,
-    ".stl": read_stl,
-    ".vtp": _read_vtk,
-    ".vtk": _read_vtk,
-    ".vtu": _read_vtk,
-    ".gii": read_gifti,
-    **dict.fromkeys((".pial", ".white", ".orig", ".smoothwm", ".inflated"), read_freesurfer),
-    **dict.fromkeys((".txt", ".csv", ".tsv", ".pts", ".particles"), read_table),
+    ".obj": _read_mesh,
+    ".off": _read_mesh,
+    ".ply": _read_ply,
+    ".stl": _read_mesh,
+    **dict.fromkeys((".vtp", ".vtk", ".vtu"), _read_vtk),
+    ".gii": _read_gifti,
+    **dict.fromkeys((".pial", ".white", ".orig", ".smoothwm", ".inflated"), _read_freesurfer),
+    **dict.fromkeys((".txt", ".csv", ".tsv", ".pts", ".particles"), _read_table),
     ".asc": _read_asc,
     ".xyz": _read_xyz,
-    ".pcd": read_pcd,
-    ".fcsv": read_fcsv,
-    ".mrk.json": read_mrk,
+    ".pcd": _read_pcd,
+    **dict.fromkeys((".fcsv", ".mrk.json"), _read_slicer),
     ".npy": _read_npy,
     ".npz": _read_npz,
     ".h5": _read_h5,

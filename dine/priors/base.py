@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dine.config import PRIOR_ARGUMENTS, Section, validate_section
 from dine.errors import CheckpointError, ConfigError, DataError
 from dine.models.checkpoint import load_tensors, rebuilt, save_tensors
 from dine.priors.gaussian import LinearGaussian
-from dine.priors.sources import check_sources
 from dine.registry import Registry
+
+if TYPE_CHECKING:
+    from dine.config import Section
 
 # A file of one prior needs the module of that one.
 PRIORS: Registry[Prior] = Registry(
@@ -104,6 +105,10 @@ class Prior(nn.Module):
                 or fields that leave nothing to be fitted.
             Interrupted: SIGTERM or SIGINT came, and the state is saved.
         """
+        # Using one takes no settings, whose checks take a while to import.
+        from dine.config import PRIOR_ARGUMENTS, validate_section
+        from dine.priors.sources import check_sources
+
         more = {"unfinished": arguments.pop("unfinished", None)} if cls.resumable else {}
         where = f"arguments of the {cls.registered_name} prior"
         given = validate_section(PRIOR_ARGUMENTS[cls.registered_name], arguments, where)

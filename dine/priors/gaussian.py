@@ -7,10 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, lapack, solve_triangular
 from scipy.spatial.distance import cdist
 
-_ROWS = 512
+from dine.threads import available, share
+
+# Covariances of so many places stay in cache.
+_ROWS = 128
 # Share of the points with an observation from which on the others are not worth leaving out.
 _MOST_SEEN = 0.9
 # Solutions of a system in single precision until its error is that of double precision.
@@ -104,11 +107,33 @@ class CovarianceRoot:
         at_pivots = solve_triangular(
             self.lower, amplitudes, lower=True, trans="T", check_finite=False
         )
+        widths, heights, affine = self.kernel
+        weights = [height**2 * at_pivots for height in heights]
+        # The affine part is one of the places alone.
+        slope = affine**2 * self.pivots.T @ at_pivots
+        still = affine**2 * at_pivots.sum(axis=0)
+        # One product gives ‖x‖² − 2 x·y + ‖y‖² for all pairs.
+        right = np.vstack(
+            [-2 * self.pivots.T, np.ones(len(self.pivots)), (self.pivots**2).sum(axis=1)]
+        )
         found = np.empty((len(places), amplitudes.shape[1]))
-        # The covariance of so many rows stays in cache.
-        for first in range(0, len(places), _ROWS):
-            rows = slice(first, first + _ROWS)
-            found[rows] = squared_exponential(places[rows], self.pivots, *self.kernel) @ at_pivots
+
+        # Memory of every worker; fresh one would cost more than the arithmetic.
+        left = np.ones((available(), _ROWS, 5))
+        room = np.empty((available(), 2, _ROWS, len(self.pivots)))
+
+        def fill(worker: int, first: int) -> None:
+            here = places[first : first + _ROWS]
+            left[worker, : len(here), :3] = here
+            left[worker, : len(here), 3] = np.einsum("nc,nc->n", here, here)
+            squared = np.matmul(left[worker, : len(here)], right, out=room[worker, 0, : len(here)])
+            total, part = here @ slope + still, room[worker, 1, : len(here)]
+            for width, weight in zip(widths, weights, strict=True):
+                np.multiply(squared, -0.5 / width**2, out=part)
+                total += np.exp(part, out=part) @ weight
+            found[first : first + _ROWS] = total
+
+        share(range(0, len(places), _ROWS), fill)
         return found
 
 
@@ -184,6 +209,9 @@ def most_probable(prior: LinearGaussian, pulled: np.ndarray, precision: np.ndarr
 def _weighted_gram(kernel: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """(r, r) Σ weight · row · rowᵀ over rows (N, r), whose weights may be negative."""
     # A product of a matrix with itself takes half the time of one with another.
+    if not (weight < 0).any():
+        rows = kernel * np.sqrt(weight).astype(kernel.dtype)[:, None]
+        return rows.T @ rows
     order = np.argsort(weight < 0, kind="stable")
     rows = kernel[order]
     rows *= np.sqrt(np.abs(weight[order])).astype(kernel.dtype)[:, None]
@@ -253,10 +281,8 @@ class Posterior:
     def determined(self) -> float:
         """How many amplitudes the data determine (MacKay, 1992, Bayesian interpolation, equation
         4.10)."""
-        inverse = solve_triangular(
-            self._factor[0], np.eye(len(self._factor[0])), lower=True, check_finite=False
-        )
-        return len(inverse) - float((inverse**2).sum())
+        inverse, _ = lapack.dtrtri(self._factor[0], lower=1)
+        return len(inverse) - float((np.tril(inverse) ** 2).sum())
 
     @cached_property
     def scale(self) -> float:
@@ -270,16 +296,27 @@ class Posterior:
     def covariance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
         """(M, 3, 3) of the field where the prior has these rows of its kernel (M, r), and modes
         (R, M, 3) if it has any."""
-        first, rank = len(self.shared), len(self.alone)
-        solved = np.empty((3, first + 3 * rank, len(kernel)))
-        for axis in range(3):
-            rows = np.zeros(solved.shape[1:])
-            if first:
-                rows[:first] = modes[:, :, axis]
-            rows[first + axis * rank : first + (axis + 1) * rank] = kernel.T
-            solved[axis] = solve_triangular(self._factor[0], rows, lower=True, check_finite=False)
+        solved = self._whitened(kernel, modes)
         return np.einsum("akm,bkm->mab", solved, solved, optimize=True)
 
     def variance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
         """Sum (M,) of the field's three variances, likewise."""
-        return np.trace(self.covariance(kernel, modes), axis1=1, axis2=2)
+        solved = self._whitened(kernel, modes)
+        return np.einsum("akm,akm->m", solved, solved)
+
+    def _whitened(self, kernel: np.ndarray, modes: np.ndarray | None) -> np.ndarray:
+        """(3, R + 3r, M), whose products over the second axis are the covariances."""
+        first, rank = len(self.shared), len(self.alone)
+        solved = np.empty((3, first + 3 * rank, len(kernel)))
+        for axis in range(3):
+            # Above the first row that is not zero nor is the solution.
+            begin = 0 if first else axis * rank
+            rows = np.zeros((first + 3 * rank - begin, len(kernel)))
+            if first:
+                rows[:first] = modes[:, :, axis]
+            rows[first + axis * rank - begin : first + (axis + 1) * rank - begin] = kernel.T
+            solved[axis, :begin] = 0
+            solved[axis, begin:] = solve_triangular(
+                self._factor[0][begin:, begin:], rows, lower=True, check_finite=False
+            )
+        return solved

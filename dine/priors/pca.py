@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dine.config import PCAArguments
 from dine.errors import DataError
-from dine.extras import extras_needed
 from dine.priors.base import PRIORS, Prior, Sample, check_sizes
 from dine.priors.gaussian import LinearGaussian
+
+if TYPE_CHECKING:
+    from dine.config import PCAArguments
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +53,8 @@ class PCAPrior(Prior):
     def _of_span(cls, fields: np.ndarray, given: PCAArguments, **shape: Any) -> Self:
         """The prior with span and latent covariance of the fields; ``shape`` goes to the class."""
         # Only fitting needs scikit-learn, which takes a while to import.
+        from dine.extras import extras_needed
+
         with extras_needed():
             from sklearn.covariance import empirical_covariance, shrunk_covariance
             from sklearn.decomposition import PCA

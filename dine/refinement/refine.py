@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from dine.priors.gaussian import LinearGaussian
 from dine.refinement.em import Estimate, Mixture
 from dine.refinement.process import LOOSE, STIFF
-from dine.refinement.shared_points import SharedPoints
+from dine.threads import each
 
 ROUNDS = 40
 
@@ -98,17 +98,23 @@ def refine(
     """
     # Small systems, for which many threads only wait for each other.
     with threadpool_limits(1, user_api="blas"):
-        stiff = Mixture(source, target, STIFF.at(source), STIFF.least, int(options.part))
+        stiff = STIFF.at(source)
+
+        def mixture() -> Mixture:
+            return Mixture(source, target, stiff, STIFF.least, int(options.part))
+
         starts = [np.zeros_like(source)]
         if observed is not None:
             # Neighbours err alike, so a point says less about the field than its own error does.
             precision = 1 / np.maximum(2 * observed.error, 0.02) ** 2
-            smoothed, _ = stiff.most_probable(observed.displacement, precision)
+            smoothed, _ = mixture().most_probable(observed.displacement, precision)
             if options.rounds == 0:
                 return Refined(smoothed)
             starts.insert(0, smoothed)
         alone = prior is None and (options.part or not options.shared)
-        searched = [stiff.rounds(start, options.rounds, only_half=alone) for start in starts]
+        searched = each(
+            lambda start: mixture().rounds(start, options.rounds, only_half=alone), starts
+        )
         early = min((half for half, _ in searched), key=lambda half: half.improbability)
         if alone:
             return Refined(early.field)
@@ -125,6 +131,8 @@ def _finished(
     options: Options,
 ) -> tuple[np.ndarray, float]:
     """Of the fields (N, 3) that go on under a prior, the one that matches most, and the share."""
+    from dine.refinement.shared_points import SharedPoints  # scans seldom hold the same points
+
     loose = Mixture(source, target, prior, LOOSE.least, int(options.part))
     shared = SharedPoints(source, target)
     best, most = None, 0.0

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dine.geometry.distance import spacings
+from dine.geometry.distance import nearest, spacings
 from dine.priors.gaussian import LinearGaussian
 from dine.refinement.em import Matches, Mixture
 
@@ -41,16 +41,16 @@ class SharedPoints:
         if not self._few:
             self._tree = cKDTree(target)
             self._spacing = np.median(spacings(target))
-            self._neighbours = cKDTree(source).query(source, k=_NEIGHBOURS + 1)[1][:, 1:]
+            self._neighbours = nearest(cKDTree(source), source, [*range(2, _NEIGHBOURS + 2)])[1]
 
     def matches(self, field: np.ndarray) -> Matches:
         """What is matched once the field (N, 3) has moved the source."""
         moved = self.source + field
-        distance, nearest = self._tree.query(moved)
-        back = cKDTree(moved).query(self.target)[1]
-        mutual = back[nearest] == np.arange(len(moved))
+        distance, closest = nearest(self._tree, moved)
+        back = nearest(cKDTree(moved), self.target)[1]
+        mutual = back[closest] == np.arange(len(moved))
         close = mutual & (distance < _CLOSE * self._spacing)
-        return Matches(close & (close[self._neighbours].mean(axis=1) >= _AGREEING), nearest)
+        return Matches(close & (close[self._neighbours].mean(axis=1) >= _AGREEING), closest)
 
     def grow(self, field: np.ndarray, prior: LinearGaussian) -> tuple[np.ndarray, float]:
         """A field (N, 3) that puts every matched point onto its target, and the share matched.

@@ -18,13 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 from threadpoolctl import threadpool_limits
 
-from dine.geometry.distance import spacings
+from dine.geometry.distance import nearest, spacings
 from dine.geometry.oriented import (
     Curve,
     MovingNormals,
@@ -34,6 +35,7 @@ from dine.geometry.oriented import (
     unit,
 )
 from dine.priors.gaussian import LinearGaussian, Posterior, most_probable
+from dine.threads import each
 
 
 @dataclass(frozen=True)
@@ -277,8 +279,8 @@ def _fields(
     for first in search.options.firsts:
         schedule = np.geomspace(max(first, between), between, search.options.rounds)
         ends = []
-        for start in starts:
-            found = few.posterior(start[rows], less, schedule)
+        descend = partial(few.posterior, prior=less, schedule=schedule)
+        for found in each(descend, [start[rows] for start in starts]):
             field = prior.mean + prior.kernel[:, :rank] @ found.alone
             field += np.tensordot(found.shared, modes, axes=1)
             ends.append(field)
@@ -365,8 +367,8 @@ class _Search:
     def tell_sides(self, field: np.ndarray) -> None:
         """Find out, where a field (N, 3) brings the source, which normals are the same side's."""
         moved = self.source.points + field[: len(self.source.points)]
-        nearest = self.places.query(moved)[1]
-        product = np.einsum("nc,nc->n", self.normals(moved), self.target.normals[nearest])
+        closest = nearest(self.places, moved)[1]
+        product = np.einsum("nc,nc->n", self.normals(moved), self.target.normals[closest])
         clear = np.abs(product) > self.least
         same = (product[clear] > 0).mean() if clear.any() else 0.5
         if same > _ONE_SIDED:
@@ -473,8 +475,8 @@ class _Search:
             there = self.target.points[matched]
             back = np.concatenate(
                 [
-                    cKDTree(moved).query(there[:count])[0],
-                    self.places.query(moved)[0][index[count:]],
+                    nearest(cKDTree(moved), there[:count])[0],
+                    nearest(self.places, moved)[0][index[count:]],
                 ]
             )
             away = np.linalg.norm(there - moved[index], axis=1)
@@ -495,8 +497,8 @@ class _Search:
         ways = []
         for sign in self.signs:
             here = np.hstack([moved, sign * turning * normals])
-            away, to = tree.query(here) if tree else nothing
-            back, asked = _tree(here).query(asking)
+            away, to = nearest(tree, here) if tree else nothing
+            back, asked = nearest(_tree(here), asking)
             index = np.concatenate([np.arange(count), asked])
             matched = np.concatenate([to, self.asking])
             ways.append((np.concatenate([away, back]), index, matched, sign * normals[index]))
@@ -512,7 +514,7 @@ class _Search:
 
 def _tree(places: np.ndarray) -> cKDTree:
     """One that is soon made, for places (n, k) that are asked about once."""
-    return cKDTree(places, balanced_tree=False, compact_nodes=False)
+    return cKDTree(places, leafsize=24, balanced_tree=False)
 
 
 class _Rims:
@@ -535,8 +537,8 @@ class _Rims:
             return np.zeros((count, 3)), np.zeros((count, 3, 3)), 0.0
         options = self.options
         moved = self.source.points + field
-        away, to = self.tree.query(moved)
-        back = cKDTree(moved).query(self.target.points[to])[0]
+        away, to = nearest(self.tree, moved)
+        back = nearest(cKDTree(moved), self.target.points[to])[0]
         squared = away**2 / (options.reach * deviation) ** 2
         known = away <= 2 * back + deviation
         unexplained = np.where(known, squared / (1 + squared), options.missing)

@@ -29,6 +29,7 @@ from dine.refinement.refine import DEFAULTS, Observed, Options, refine
 from dine.registration.shapes import FEWEST, drawn
 from dine.registration.surfaces import FULL, QUICK, Detail, refined_on_surfaces
 from dine.registration.types import Correspondence, Model, Motion, Overlap, Pair, Settings
+from dine.threads import each
 
 # A source point is shown by the target if a target point ends up within so many spacings of it.
 _RETURN = 3.0
@@ -176,15 +177,12 @@ def _of_parts(
     the wrong way round, say, one within the other. All are looked at quickly. The first is carried
     to the end and kept, unless another is clearly more probable.
     """
-    looks = []
-    for pair in pairs:
-        found = correspond(pair, model, settings, QUICK)
+    looks = each(lambda pair: (pair, correspond(pair, model, settings, QUICK)), pairs)
+    for pair, found in looks:
         if found.improbability is None:  # the same points, which leave nothing open
             return pair, found
-        looks.append((pair, found))
     best = None
-    for pair in _worth_more(looks):
-        one = pair, correspond(pair, model, settings)
+    for one in each(lambda pair: (pair, correspond(pair, model, settings)), _worth_more(looks)):
         if best is None or _unlikely(one[1]) < _unlikely(best[1], _BETTER):
             best = one
     return best

@@ -9,7 +9,6 @@ import numpy as np
 
 from dine.errors import DataError
 from dine.geometry.surface import Surface
-from dine.io import polygons
 
 _EXPECTED = (
     "expected a file, (V, 3) points, a pair of vertices and faces, or a mesh or cloud of trimesh, "
@@ -54,6 +53,8 @@ def surface_of(shape: Any, name: str) -> Surface:
 
 def _faces(shape: Any, name: str) -> np.ndarray | None:
     """Triangles (F, 3); None of a cloud."""
+    from dine.io import polygons  # of objects alone
+
     found = []
     if isinstance(getattr(shape, "cells_dict", None), Mapping):  # meshio, PyVista's grids
         kinds = {str(kind): array_of(cells) for kind, cells in shape.cells_dict.items()}
@@ -83,5 +84,7 @@ def _faces(shape: Any, name: str) -> np.ndarray | None:
 
 def _cut(cells: np.ndarray) -> np.ndarray:
     """Triangles (F, 3) of cells (C, k), all of k corners."""
+    from dine.io import polygons
+
     ends = cells.shape[1] * np.arange(1, len(cells) + 1)
     return cells.reshape(-1)[polygons.fans(ends)]

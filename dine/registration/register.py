@@ -38,6 +38,7 @@ from dine.registration.shapes import (
 )
 from dine.registration.types import (
     Correspondence,
+    ExpectedError,
     Guide,
     Model,
     Motion,
@@ -47,6 +48,7 @@ from dine.registration.types import (
     Settings,
     Trust,
 )
+from dine.threads import together
 
 # Share of the source without counterpart that is more than a rim.
 _WORTH_SAYING = 0.02
@@ -195,15 +197,15 @@ def _registered(
     pair, correspondence = correspondence_of(source, target, model, settings)
     stage("measures")
     notes += _parts(settings, correspondence)
-    if looks_mirrored(pair, correspondence, settings):
-        notes.append(MIRRORED)
-
     motion = Motion(pair.alignment, correspondence.interpolated())
-    moved = motion.surface(source)
-    displacement = moved.vertices - source.vertices
     calibration = model.calibration_for(settings, correspondence.overlap)
-    expected = expected_error(calibration, correspondence, pair)
-    measures = measure(pair, correspondence, motion, model, settings, expected)
+    mirrored, (moved, expected, measures) = together(
+        lambda: looks_mirrored(pair, correspondence, settings),
+        lambda: _measured(pair, correspondence, motion, model, settings),
+    )
+    if mirrored:
+        notes.append(MIRRORED)
+    displacement = moved.vertices - source.vertices
     trust = assess(
         calibration,
         measures.normalised,
@@ -236,6 +238,16 @@ def _registered(
         motion=motion,
         applied_from={name: surface.vertices for name, surface in further.items()},
     )
+
+
+def _measured(
+    pair: Pair, correspondence: Correspondence, motion: Motion, model: Model, settings: Settings
+) -> tuple[Surface, ExpectedError | None, Measures]:
+    """The moved source, how far it is expected to be off, and what is measured of it."""
+    moved = motion.surface(pair.source)
+    calibration = model.calibration_for(settings, correspondence.overlap)
+    expected = expected_error(calibration, correspondence, pair)
+    return moved, expected, measure(pair, correspondence, motion, model, settings, expected)
 
 
 def _parts(settings: Settings, correspondence: Correspondence) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,11 +15,13 @@ from dine.geometry.frame import Frame
 from dine.geometry.interpolation import FittedDisplacement
 from dine.geometry.rigid import Alignment, check_rigid
 from dine.geometry.surface import Surface
-from dine.geometry.voxels import NodeField, Voxels
 from dine.io import announced
 from dine.priors.gaussian import CovarianceRoot
 from dine.registration.surfaces import ProcessField
 from dine.registration.types import Motion, RegistrationResult, Trust
+
+if TYPE_CHECKING:
+    from dine.geometry.voxels import NodeField
 
 ENDING = "result.npz"
 _FORMAT = 1
@@ -132,15 +134,6 @@ def _field_arrays(field: Callable[[np.ndarray], np.ndarray]) -> dict[str, np.nda
     """What a field is given by; it is told by the names which kind it is."""
     if isinstance(field, FittedDisplacement):
         return {"points": field.points, "displacement": field.displacement}
-    if isinstance(field, NodeField):
-        voxels = field.voxels
-        return {
-            "nodes": voxels.nodes,
-            "cubes": voxels.cubes,
-            "edge": np.array(voxels.edge),
-            "displacement": field.displacement,
-            "rotation": field.rotation,
-        }
     if isinstance(field, ProcessField):
         widths, deviations, affine = field.root.kernel
         return {
@@ -150,6 +143,17 @@ def _field_arrays(field: Callable[[np.ndarray], np.ndarray]) -> dict[str, np.nda
             "deviations": np.array(deviations),
             "affine": np.array(affine),
             "amplitudes": field.amplitudes,
+        }
+    from dine.geometry.voxels import NodeField  # of priors of an organ alone
+
+    if isinstance(field, NodeField):
+        voxels = field.voxels
+        return {
+            "nodes": voxels.nodes,
+            "cubes": voxels.cubes,
+            "edge": np.array(voxels.edge),
+            "displacement": field.displacement,
+            "rotation": field.rotation,
         }
     raise TypeError(f"a field of the type {type(field).__name__} cannot be saved")
 
@@ -185,6 +189,8 @@ def _node_field(
         raise ValueError("the parts of its field do not fit each other")
     if not (cubes.min() >= 0 and cubes.max() < len(nodes) and edge > 0):
         raise ValueError("the cubes of its field name nodes that are not there")
+    from dine.geometry.voxels import NodeField, Voxels
+
     voxels = Voxels(nodes, cubes, np.ones(len(cubes)), float(edge))
     return NodeField(voxels, displacement, rotation)
 

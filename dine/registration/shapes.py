@@ -11,10 +11,10 @@ from scipy.spatial import cKDTree
 
 from dine.data.sampling import SurfaceSamples, sample_surface
 from dine.errors import ConfigError, DataError
+from dine.geometry.distance import nearest
 from dine.geometry.oriented import evenly
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
-from dine.io.slicer import in_space
 from dine.io.text import format_stem
 from dine.registration.objects import array_of, surface_of
 
@@ -114,6 +114,8 @@ def checked_landmarks(
 
 def _in_space_of(points: Points, scan: Surface) -> np.ndarray:
     if isinstance(points, str | Path):
+        from dine.io.slicer import in_space
+
         return in_space(read_surface(points), scan.space or "LPS")
     return np.asarray(array_of(points), dtype=np.float64)
 
@@ -214,7 +216,7 @@ def near_points(points: np.ndarray) -> np.ndarray:
     count = len(points)
     if count <= _COMPANY:
         return np.ones(count, bool)
-    gap = cKDTree(points).query(points, k=[_COMPANY + 1])[0][:, 0]
+    gap = nearest(cKDTree(points), points, [_COMPANY + 1])[0][:, 0]
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     size = np.quantile(distance, 0.95, method="lower")
     return gap <= max(_APART * size, _UNUSUAL_GAP * np.median(gap))

@@ -11,7 +11,7 @@ from scipy.linalg import solve
 from scipy.spatial import cKDTree
 
 from dine.data.sampling import sample_surface
-from dine.geometry.distance import spacings
+from dine.geometry.distance import nearest, spacings
 from dine.geometry.interpolation import within_reach
 from dine.geometry.oriented import (
     Curve,
@@ -160,7 +160,7 @@ def refined_on_surfaces(
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
     unmet, shown, lacking = _covered(end, settings.overlap)
-    nearest = cKDTree(moving.surface.points).query(found.start)[1]
+    closest = nearest(cKDTree(moving.surface.points), found.start)[1]
     return replace(
         found,
         field=anywhere(found.start),
@@ -169,7 +169,7 @@ def refined_on_surfaces(
         improbability=end.improbability,
         unmet=unmet,
         shown=shown,
-        supported=~lacking[nearest],
+        supported=~lacking[closest],
     )
 
 
@@ -201,7 +201,7 @@ def _measured(surface: Surface) -> tuple[int, float]:
         return len(points), 0.0
     points = points[near_points(points)]
     some = points[:: max(len(points) // _LOOKED_AT, 1)]
-    return len(points), float(np.median(cKDTree(points).query(some, k=2)[0][:, 1]))
+    return len(points), float(np.median(nearest(cKDTree(points), some, [2])[0][:, 0]))
 
 
 def _rough(

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dine.geometry.kernels import jit
 from dine.geometry.neighbours import Neighbours
-from dine.models.compiled.parallel import jit, run, share
 from dine.models.compiled.rows import (
     Rows,
     Statistics,
@@ -24,6 +24,7 @@ from dine.models.compiled.rows import (
     norm_gradient,
     sums,
 )
+from dine.threads import run, share
 
 
 @jit

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from dine.geometry.graph import Graph
-from dine.models.compiled.parallel import jit, run
+from dine.geometry.kernels import jit
+from dine.threads import run
 
 _STEP = 4
 

@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dine.models.compiled.parallel import jit, run
+from dine.geometry.kernels import jit
+from dine.threads import run
 
 _BLOCK_ROWS = 256
 _TILE_ENTRIES = 2**17

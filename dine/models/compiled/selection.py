@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dine.models.compiled.parallel import jit, run
+from dine.geometry.kernels import jit
+from dine.threads import run
 
 _BLOCK = 2**18
 """Entries of a block of distances, so that it stays in a core's cache."""
