@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 import trimesh
 from commands import run
 
@@ -293,6 +294,20 @@ def test_the_same_seed_gives_the_same_result(pair, result, coarse):
     assert (again.moved.vertices == result.moved.vertices).all()
     other = dine.register(*pair, points=POINTS, seed=1, surfaces=False)
     assert (other.moved.vertices != coarse.moved.vertices).any()
+
+
+def test_the_number_of_threads_does_not_matter(pair, result):
+    before = torch.get_num_threads()
+    torch.set_num_threads(3 if before == 1 else 1)
+    try:
+        other = dine.register(*pair, points=POINTS)
+    finally:
+        torch.set_num_threads(before)
+    # Libraries may round otherwise.
+    apart = np.abs(other.moved.vertices - result.moved.vertices).max()
+    assert apart < 1e-4 * result.alignment.frame.scale
+    np.testing.assert_allclose(other.uncertainty, result.uncertainty, rtol=1e-2)
+    assert other.trust.verdict == result.trust.verdict
 
 
 def test_a_turned_source_is_aligned_first(pair):
