@@ -51,6 +51,9 @@ def test_within_a_shared_piece_of_work_there_is_one_thread(count):
     found = threads.each(outer, range(4))
     assert {available for available, _ in found} == {1}
     assert all(len(idents) == 1 for _, idents in found)
+    ranges = []
+    threads.run(lambda first, last: ranges.append(threads.available()), 0, 9)
+    assert ranges == [1] * count
     if count > 1:
         assert all(blas == {1} for _, _, blas in threads.each(inner, range(4)))
     assert threads.available() == torch.get_num_threads() == count
