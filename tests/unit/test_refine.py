@@ -268,7 +268,7 @@ def test_points_that_cannot_be_shared_are_not_looked_for(pair, monkeypatch):
     source = pair[0]
     others = organ(len(source), 11) + 0.1
     expected = refine(source, others).mean
-    monkeypatch.setattr("dine.refinement.refine.SharedPoints", None)
+    monkeypatch.setattr("dine.refinement.shared_points.SharedPoints", None)
     found = refine(source, others, options=Options(shared=False)).mean
     np.testing.assert_array_equal(found, expected)
 
