@@ -178,7 +178,7 @@ def place_names(place: tuple[str, str, str]) -> list[str]:
 def ends(percent: list[float]) -> str:
     """The least and the most of differences, in the order of their size."""
     low, high = min(percent), max(percent)
-    first, last = (low, high) if low > 0 else (high, low)
+    first, last = (low, high) if low >= 0 else (high, low)
     return f"{signed(first)} to {signed(last)}"
 
 
