@@ -319,9 +319,8 @@ class _Trainer:
         """Errors after so many steps, whose weights are remembered if they are the best so far."""
         settings = self.job.settings
         found = validation_errors(self.backbone, validated, settings.validation_pairs)
-        if settings.keep == "best" and not (
-            self.best is not None and self.best["val_cd"] <= found["val_cd"]
-        ):
+        better = self.best is None or found["val_cd"] < self.best["val_cd"]
+        if settings.keep == "best" and better:
             model = {name: x.detach().clone() for name, x in self.backbone.state_dict().items()}
             self.best = {"step": step, "val_cd": found["val_cd"], "model": model}
         return found
