@@ -10,6 +10,7 @@ from torch import Tensor
 
 from dine.config import FlowArguments
 from dine.extras import extras_needed
+from dine.optimiser import AdamW
 from dine.priors.base import LARGEST_DEPTH, PRIORS, Prior, Sample, check_sizes
 from dine.priors.likelihood import Ascent, Unfinished, maximise_likelihood
 
@@ -61,7 +62,7 @@ class FlowPrior(Prior):
             return pool[torch.randint(len(pool), (count,), generator=generator)]
 
         count = min(given.batch_size, len(pool))
-        optimiser = torch.optim.AdamW(prior.flow.parameters(), lr=given.learning_rate)
+        optimiser = AdamW(prior.flow.parameters(), lr=given.learning_rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, given.steps)
         ascent = Ascent(prior.flow, prior._log_density, optimiser, schedule)
         maximise_likelihood(ascent, draw, steps=given.steps, seed=seed, unfinished=unfinished)

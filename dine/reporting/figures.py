@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
 from dine.config import STAGE1
@@ -57,18 +58,16 @@ def save_figure(figure: Figure, path_stem: str | os.PathLike) -> list[Path]:
 
     The files carry no dates or versions, so that the same numbers give the same bytes.
     """
-    canvas = FigureCanvasAgg(figure)
-    paths = []
-    for suffix, metadata in (
-        ("png", {"Software": None}),
-        ("pdf", {"CreationDate": None, "Creator": None, "Producer": None}),
-    ):
-        path = Path(f"{path_stem}.{suffix}")
-        with atomic_path(path) as temporary:
-            canvas.print_figure(temporary, dpi=150, metadata=metadata, facecolor="white")
-        figure.set_layout_engine("none")  # found once; it takes as long as drawing
-        paths.append(path)
-    return paths
+    figure.set_dpi(150)
+    png, pdf = (Path(f"{path_stem}.{suffix}") for suffix in ("png", "pdf"))
+    # Not through `savefig`, which draws every figure once more to see what it needs.
+    with atomic_path(png) as temporary:
+        FigureCanvasAgg(figure).print_png(temporary, metadata={"Software": None})
+    figure.set_layout_engine("none")  # found once; it takes as long as drawing
+    nothing = {"CreationDate": None, "Creator": None, "Producer": None}
+    with atomic_path(pdf) as temporary:
+        FigureCanvasPdf(figure).print_pdf(temporary, metadata=nothing)
+    return [png, pdf]
 
 
 def new_figure(width: float, height: float, title: str, origin: str, note: str = "") -> Figure:

@@ -32,6 +32,7 @@ from dine.geometry.chamfer import chamfer_distance
 from dine.geometry.folding import roughness
 from dine.models.backbones import Backbone
 from dine.models.devices import chosen_device, leased
+from dine.optimiser import AdamW
 from dine.progress import Progress
 from dine.results import Network
 from dine.state import Interrupted, StopRequest, load_state, one_writer, save_state
@@ -236,7 +237,7 @@ class _Trainer:
         backbone.to(team.device).train()
         if job.objective.prior is not None:
             job.objective.prior.to(team.device)
-        self.optimiser = torch.optim.AdamW(
+        self.optimiser = AdamW(
             backbone.parameters(),
             lr=job.settings.learning_rate,
             weight_decay=job.settings.weight_decay,
