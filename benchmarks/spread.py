@@ -3,9 +3,9 @@
     python benchmarks/spread.py results run-of-another-seed/results … > spread.md
 
 Each argument is the results folder of a finished run. Printed as Markdown: how each run was made;
-mean Chamfer distances over all runs, and what all of them say of each prior, also by level; for
-each prior, dataset and backbone the difference of its mean Chamfer distance to the control's, run
-by run, with the verdict; and the standard deviation over runs, which is what
+mean Chamfer distances over all runs, and what all of them say of each prior, also by level and
+taken together; for each prior, dataset and backbone the difference of its mean Chamfer distance to
+the control's, run by run, with the verdict; and the standard deviation over runs, which is what
 `evaluation.training_spread` and `evaluation.training_spread_outliers` stand for. Ends with 1 if one
 run says lower and another higher.
 """
@@ -36,13 +36,17 @@ MARKS = {"lower": "", "higher": " (higher)", "undecided": " (undecided)"}
 
 @dataclass(frozen=True)
 class Finished:
-    """A run: how it was made, its metrics, and the effects of its priors against the control, and
-    against the better of control and Stage 1: a control may be worse than what it started from."""
+    """A run: how it was made, its metrics, and the effects of its priors against the control,
+    against Stage 1, and against the better of the two: a control may be worse than its start."""
 
     made: dict[str, str]
     metrics: pd.DataFrame
     control: pd.DataFrame
-    both: pd.DataFrame
+    first: pd.DataFrame
+
+    @property
+    def both(self) -> pd.DataFrame:
+        return against_both(self.control, self.first)
 
 
 def read(folder: Path) -> Finished:
@@ -57,7 +61,7 @@ def read(folder: Path) -> Finished:
     )
     spread = spread_of(settings.evaluation)
     control, first = (effects(metrics, reference, spread=spread) for reference in (CONTROL, STAGE1))
-    return Finished(made, metrics, control, against_both(control, first))
+    return Finished(made, metrics, control, first)
 
 
 def against_both(control: pd.DataFrame, first: pd.DataFrame) -> pd.DataFrame:
@@ -83,6 +87,7 @@ def main(folders: list[Path]) -> int:
         print(f"| {number} | {' | '.join(cells)} |")
     print()
     summary([run.metrics for run in found], [run.both for run in found])
+    together(found)
     controls = [run.control for run in found]
     numbers = range(1, len(found) + 1)
     for condition in (CLEAN, "outliers", "noise", "resampled"):
@@ -163,6 +168,47 @@ def levels(clean: list[pd.DataFrame], order: list[str]) -> None:
         "\nLevels at which the mean lies below both others, run by run; and the difference of\n"
         "the mean over levels and runs to that of Stage 1.\n"
     )
+
+
+def together(found: list[Finished]) -> None:
+    """Print what all runs say as one sample, on clean targets.
+
+    Runs share neither data nor weights, so the difference is the mean of theirs, and its variance
+    theirs divided by their number: that of each run's interval, or that between the runs where it
+    is larger. Of the two references the one is shown that a prior gains less over.
+    """
+    joint = [joined([getattr(run, name) for run in found]) for name in ("control", "first")]
+    priors = [name for name in METHODS if name in set(joint[0].index.get_level_values("method"))]
+    heading("| objects | dataset | backbone |", map(display_name, priors))
+    for place in dict.fromkeys(index[:3] for index in joint[0].index):
+        cells = []
+        for name in priors:
+            if (*place, name) not in joint[0].index:
+                cells.append("–")
+                continue
+            mean, low, high = max(tuple(table.loc[(*place, name)]) for table in joint)
+            decided = all(table.loc[(*place, name), "high"] < 0 for table in joint)
+            mark = "**" if decided else ""
+            said = f"{signed(mean)} %"
+            cells.append(f"{mark}{said}{mark} ({signed(low)} to {signed(high)})")
+        print(f"| {' | '.join([*place_names(place), *cells])} |")
+    print(
+        "\nDifference to the better of Stage 1 and control over all runs together, with its 95 % "
+        "interval.\nBold: below both, and neither interval holds zero.\n"
+    )
+
+
+def joined(tables: list[pd.DataFrame]) -> pd.DataFrame:
+    """``mean``, ``low`` and ``high`` of the difference on clean targets, by place and method."""
+    rows = pd.concat([table[table["condition"] == CLEAN] for table in tables])
+    rows = rows.assign(variance=((rows["high"] - rows["low"]) / (2 * 1.96)) ** 2)
+    groups = rows.groupby(KEYS, sort=False)
+    # A missing interval of one run leaves the joint one missing.
+    within = groups["variance"].agg(lambda x: x.mean(skipna=False))
+    variance = np.maximum(within, groups["relative"].var(ddof=1))
+    half = 1.96 * np.sqrt(variance / groups.size())
+    mean = groups["relative"].mean()
+    return pd.DataFrame({"mean": mean, "low": mean - half, "high": mean + half})
 
 
 def heading(first: str, others: Iterable[str]) -> None:
