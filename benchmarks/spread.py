@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 
 from dine import config as dine_config
 from dine.config import CONTROL, STAGE1
@@ -173,9 +174,10 @@ def levels(clean: list[pd.DataFrame], order: list[str]) -> None:
 def together(found: list[Finished]) -> None:
     """Print what all runs say as one sample, on clean targets.
 
-    Runs share neither data nor weights, so the difference is the mean of theirs, and its variance
-    theirs divided by their number: that of each run's interval, or that between the runs where it
-    is larger. Of the two references the one is shown that a prior gains less over.
+    Runs share neither data nor weights, so the difference is the mean of theirs. Its interval is
+    the wider of two: of the runs' own intervals, which hold the chance of pairs and trainings, and
+    of the runs' differences alone (Student's t). Of the two references the one is shown that a
+    prior gains less over.
     """
     joint = [joined([getattr(run, name) for run in found]) for name in ("control", "first")]
     priors = [name for name in METHODS if name in set(joint[0].index.get_level_values("method"))]
@@ -203,10 +205,11 @@ def joined(tables: list[pd.DataFrame]) -> pd.DataFrame:
     rows = pd.concat([table[table["condition"] == CLEAN] for table in tables])
     rows = rows.assign(variance=((rows["high"] - rows["low"]) / (2 * 1.96)) ** 2)
     groups = rows.groupby(KEYS, sort=False)
+    count = groups.size()
     # A missing interval of one run leaves the joint one missing.
-    within = groups["variance"].agg(lambda x: x.mean(skipna=False))
-    variance = np.maximum(within, groups["relative"].var(ddof=1))
-    half = 1.96 * np.sqrt(variance / groups.size())
+    own = 1.96 * np.sqrt(groups["variance"].agg(lambda x: x.mean(skipna=False)) / count)
+    between = stats.t.ppf(0.975, count - 1) * groups["relative"].std(ddof=1) / np.sqrt(count)
+    half = np.maximum(own, between)
     mean = groups["relative"].mean()
     return pd.DataFrame({"mean": mean, "low": mean - half, "high": mean + half})
 
