@@ -12,7 +12,7 @@ RULES = sorted((ROOT / "workflow" / "rules").glob("*.smk"))
 
 # From the ground up: a module imports from its own floor and those before it.
 FLOORS = [
-    ("errors", "extras", "files", "progress", "registry", "state", "threads"),
+    ("errors", "extras", "files", "optimiser", "progress", "registry", "state", "threads"),
     ("config",),
     ("results", "provenance"),
     ("plan",),
