@@ -23,7 +23,7 @@ from scipy import stats
 
 from dine import config as dine_config
 from dine.config import CONTROL, STAGE1
-from dine.evaluation.statistics import spread_of
+from dine.evaluation.statistics import Spread, spread_of, spread_under
 from dine.files import read_json
 from dine.reporting.comparisons import effects
 from dine.reporting.loading import load_metrics
@@ -44,6 +44,7 @@ class Finished:
     metrics: pd.DataFrame
     control: pd.DataFrame
     first: pd.DataFrame
+    spread: Spread
 
     @property
     def both(self) -> pd.DataFrame:
@@ -62,7 +63,7 @@ def read(folder: Path) -> Finished:
     )
     spread = spread_of(settings.evaluation)
     control, first = (effects(metrics, reference, spread=spread) for reference in (CONTROL, STAGE1))
-    return Finished(made, metrics, control, first)
+    return Finished(made, metrics, control, first, spread)
 
 
 def against_both(control: pd.DataFrame, first: pd.DataFrame) -> pd.DataFrame:
@@ -174,12 +175,17 @@ def levels(clean: list[pd.DataFrame], order: list[str]) -> None:
 def together(found: list[Finished]) -> None:
     """Print what all runs say as one sample, on clean targets.
 
-    Runs share neither data nor weights, so the difference is the mean of theirs. Its interval is
-    the wider of two: of the runs' own intervals, which hold the chance of pairs and trainings, and
-    of the runs' differences alone (Student's t). Of the two references the one is shown that a
-    prior gains less over.
+    The difference is the mean of theirs. Its interval is the wider of two: of the runs' own
+    intervals, which hold the chance of pairs and trainings, and of the runs' differences alone
+    (Student's t). Runs of one seed share their data, so they count once as to the chance of pairs.
+    Of the two references the one is shown that a prior gains less over.
     """
-    joint = [joined([getattr(run, name) for run in found]) for name in ("control", "first")]
+    seeds = len({run.made["seed"] for run in found})
+    chance = max(100 * spread_under(run.spread, CLEAN) for run in found)
+    joint = [
+        joined([getattr(run, name) for run in found], seeds, chance)
+        for name in ("control", "first")
+    ]
     priors = [name for name in METHODS if name in set(joint[0].index.get_level_values("method"))]
     heading("| objects | dataset | backbone |", map(display_name, priors))
     for place in dict.fromkeys(index[:3] for index in joint[0].index):
@@ -200,14 +206,21 @@ def together(found: list[Finished]) -> None:
     )
 
 
-def joined(tables: list[pd.DataFrame]) -> pd.DataFrame:
-    """``mean``, ``low`` and ``high`` of the difference on clean targets, by place and method."""
+def joined(tables: list[pd.DataFrame], seeds: int, chance: float) -> pd.DataFrame:
+    """``mean``, ``low`` and ``high`` of the difference on clean targets, by place and method.
+
+    Args:
+        tables: the effects of each run.
+        seeds: how many seeds, and so data, the runs have.
+        chance: standard deviation over trainings that each interval holds, in percent.
+    """
     rows = pd.concat([table[table["condition"] == CLEAN] for table in tables])
-    rows = rows.assign(variance=((rows["high"] - rows["low"]) / (2 * 1.96)) ** 2)
+    rows = rows.assign(pairs=((rows["high"] - rows["low"]) / (2 * 1.96)) ** 2 - chance**2)
     groups = rows.groupby(KEYS, sort=False)
     count = groups.size()
     # A missing interval of one run leaves the joint one missing.
-    own = 1.96 * np.sqrt(groups["variance"].agg(lambda x: x.mean(skipna=False)) / count)
+    of_pairs = groups["pairs"].agg(lambda x: x.mean(skipna=False)) / seeds
+    own = 1.96 * np.sqrt(of_pairs + chance**2 / count)
     between = stats.t.ppf(0.975, count - 1) * groups["relative"].std(ddof=1) / np.sqrt(count)
     half = np.maximum(own, between)
     mean = groups["relative"].mean()
