@@ -12,7 +12,7 @@ class AdamW(torch.optim.AdamW):
 
     PyTorch wraps these methods to keep its compiler out of them, and loads the compiler to do so:
     three seconds, more than all else that a training does before its first step. Here they are
-    called without the wrapping.
+    called without the wrapping; ``differentiable`` has no effect.
     """
 
     add_param_group = inspect.unwrap(torch.optim.AdamW.add_param_group)
