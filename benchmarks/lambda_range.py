@@ -21,7 +21,7 @@ import torch
 
 from dine import config as dine_config
 from dine.config import CONTROL, STAGE1, Stage2
-from dine.files import read_json
+from dine.files import digest, file_digest, read_json
 from dine.reporting.names import CD_SCALE, display_name
 from dine.results import Network, Results
 from dine.training.stage2 import stage2
@@ -53,19 +53,16 @@ def errors(
     given: Stage2 = settings.stage2
     changed = {"validation_pairs": ALL, "keep": "last", "steps": steps or given.steps}
     changed["validate_every"] = changed["steps"]
-    out = (
-        work
-        / f"{changed['steps']}_seed{settings.seed}"
-        / dataset
-        / backbone
-        / prior
-        / f"{weight:g}"
-    )
+    stage = given.model_copy(update=changed)
+    model = files.run(dataset, backbone, STAGE1).model
+    # Runs may share seed and settings, and results must not be taken for those of another run.
+    told = digest([stage.model_dump(), file_digest(model), settings.seed])[:12]
+    out = work / told / dataset / backbone / prior / f"{weight:g}"
     if not Network(out).record.exists():
         stage2(
             files.data(dataset).pairs,
-            files.run(dataset, backbone, STAGE1).model,
-            given.model_copy(update=changed),
+            model,
+            stage,
             Order(settings.seed, out, f"{dataset} {prior} {weight:g}"),
             variant=prior,
             prior=None if prior == CONTROL else files.prior(dataset, backbone, prior),

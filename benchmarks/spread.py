@@ -215,7 +215,8 @@ def joined(tables: list[pd.DataFrame], seeds: int, chance: float) -> pd.DataFram
         chance: standard deviation over trainings that each interval holds, in percent.
     """
     rows = pd.concat([table[table["condition"] == CLEAN] for table in tables])
-    rows = rows.assign(pairs=((rows["high"] - rows["low"]) / (2 * 1.96)) ** 2 - chance**2)
+    variance = ((rows["high"] - rows["low"]) / (2 * 1.96)) ** 2
+    rows = rows.assign(pairs=(variance - chance**2).clip(lower=0))
     groups = rows.groupby(KEYS, sort=False)
     count = groups.size()
     # A missing interval of one run leaves the joint one missing.

@@ -59,6 +59,7 @@ def save_figure(figure: Figure, path_stem: str | os.PathLike) -> list[Path]:
     The files carry no dates or versions, so that the same numbers give the same bytes.
     """
     figure.set_dpi(150)
+    figure.set_facecolor("white")  # whatever the user's style is
     png, pdf = (Path(f"{path_stem}.{suffix}") for suffix in ("png", "pdf"))
     # Not through `savefig`, which draws every figure once more to see what it needs.
     with atomic_path(png) as temporary:
