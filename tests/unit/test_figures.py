@@ -1,10 +1,12 @@
 from types import SimpleNamespace
 
 import h5py
+import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
+from PIL import Image
 from samples import evaluation
 
 from dine.errors import DataError
@@ -324,3 +326,12 @@ def test_methods_differ_in_colour_and_marker():
     styles = figures.method_styles(["stage1", "lambda0", "pca", "flow"])
     assert len({to_hex(colour) for colour, _ in styles.values()}) == 4
     assert len({marker for _, marker in styles.values()}) == 4
+
+
+def test_figures_are_white_whatever_the_style(tmp_path):
+    with matplotlib.rc_context({"figure.facecolor": "black", "savefig.facecolor": "black"}):
+        png, _ = figures.save_figure(
+            figures.new_figure(2, 2, "Title", "synthetic"), tmp_path / "figure"
+        )
+    with Image.open(png) as image:
+        assert image.convert("RGB").getpixel((0, 0)) == (255, 255, 255)
