@@ -160,7 +160,8 @@ def qualitative_figure(
     panels = _views(figure, len(examples), 1 + len(titles))
     for example, line in zip(examples, panels, strict=True):
         _example_row(line, example, list(titles), norm)
-    panels[0, 0].legend(**SMALL, loc="upper left", markerscale=2)
+    clouds, names = panels[0, 0].get_legend_handles_labels()
+    figure.legend(clouds, names, **SMALL, loc="outside lower left", ncols=2, markerscale=2)
     for axes, text in zip(panels[0], ["Before", *titles.values()], strict=True):
         axes.set_title(text, fontsize=11)
     scale = ScalarMappable(norm, _ERROR_COLOURS)

@@ -201,6 +201,24 @@ def test_qualitative_figure(stored, tmp_path):
     figures.save_figure(figure, tmp_path / "views")
 
 
+def test_a_single_row_of_views_covers_no_points_and_loses_no_words(tmp_path):
+    rng = np.random.default_rng(0)
+    cloud = rng.normal(size=(100, 3))
+    methods = ("stage1", "lambda0", "pca", "pca_residual")
+    errors = {name: np.linspace(0, 10, 100) for name in methods}
+    example = views.ExamplePair("Clean", cloud, cloud, dict.fromkeys(methods, cloud), errors)
+    figure = views.qualitative_figure([example], "Views", "synthetic")
+    figures.save_figure(figure, tmp_path / "views")
+
+    page = figure.bbox
+    bar = figure.axes[-1].get_tightbbox()
+    assert page.x0 <= bar.x0 < bar.x1 <= page.x1
+    assert page.y0 <= bar.y0 < bar.y1 <= page.y1
+    (legend,) = figure.legends
+    for axes in figure.axes:
+        assert not legend.get_window_extent().overlaps(axes.get_window_extent())
+
+
 def test_picked_examples_are_the_median_hard_cases(metrics):
     picks = views.pick_examples("deformedtissue", "deftransnet", metrics)
     assert [key for key, _, _ in picks] == ["deformation", "noise_0.04"]
