@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy import stats
 
 from dine import config as dine_config
 from dine.config import CONTROL, STAGE1
+from dine.evaluation.repeats import joined
 from dine.evaluation.statistics import Spread, spread_of, spread_under
 from dine.files import read_json
 from dine.reporting.comparisons import effects
@@ -90,6 +90,7 @@ def main(folders: list[Path]) -> int:
     print()
     summary([run.metrics for run in found], [run.both for run in found])
     together(found)
+    each_level(found)
     controls = [run.control for run in found]
     numbers = range(1, len(found) + 1)
     for condition in (CLEAN, "outliers", "noise", "resampled"):
@@ -175,17 +176,9 @@ def levels(clean: list[pd.DataFrame], order: list[str]) -> None:
 def together(found: list[Finished]) -> None:
     """Print what all runs say as one sample, on clean targets.
 
-    The difference is the mean of theirs. Its interval is the wider of two: of the runs' own
-    intervals, which hold the chance of pairs and trainings, and of the runs' differences alone
-    (Student's t). Runs of one seed share their data, so they count once as to the chance of pairs.
     Of the two references the one is shown that a prior gains less over.
     """
-    seeds = len({run.made["seed"] for run in found})
-    chance = max(100 * spread_under(run.spread, CLEAN) for run in found)
-    joint = [
-        joined([getattr(run, name) for run in found], seeds, chance)
-        for name in ("control", "first")
-    ]
+    joint = of_both([(run.control, run.first) for run in found], found)
     priors = [name for name in METHODS if name in set(joint[0].index.get_level_values("method"))]
     heading("| objects | dataset | backbone |", map(display_name, priors))
     for place in dict.fromkeys(index[:3] for index in joint[0].index):
@@ -195,8 +188,7 @@ def together(found: list[Finished]) -> None:
                 cells.append("–")
                 continue
             mean, low, high = max(tuple(table.loc[(*place, name)]) for table in joint)
-            decided = all(table.loc[(*place, name), "high"] < 0 for table in joint)
-            mark = "**" if decided else ""
+            mark = "**" if lower(joint, (*place, name)) else ""
             said = f"{signed(mean)} %"
             cells.append(f"{mark}{said}{mark} ({signed(low)} to {signed(high)})")
         print(f"| {' | '.join([*place_names(place), *cells])} |")
@@ -206,26 +198,46 @@ def together(found: list[Finished]) -> None:
     )
 
 
-def joined(tables: list[pd.DataFrame], seeds: int, chance: float) -> pd.DataFrame:
-    """``mean``, ``low`` and ``high`` of the difference on clean targets, by place and method.
+def each_level(found: list[Finished]) -> None:
+    """Print at how many levels all runs together decide that a prior is below both, or control."""
+    every = sorted(set.union(*({*run.metrics["level"].dropna()} for run in found)))
+    counts: dict[tuple, list[int]] = {}
+    for level in every:
+        tables = []
+        for run in found:
+            some = run.metrics[
+                (run.metrics["condition"] == CLEAN) & (run.metrics["level"] == level)
+            ]
+            tables.append([effects(some, name, spread=run.spread) for name in (CONTROL, STAGE1)])
+        joint = of_both(tables, found)
+        for key in joint[0].index:
+            count = counts.setdefault(key, [0, 0, 0])
+            for place, said in enumerate([lower(joint, key), lower(joint[:1], key), True]):
+                count[place] += said
+    priors = [name for name in METHODS if name in {key[3] for key in counts}]
+    heading("| objects | dataset | backbone |", map(display_name, priors))
+    for place in dict.fromkeys(key[:3] for key in counts):
+        cells = []
+        for name in priors:
+            both, control, of = counts.get((*place, name), (0, 0, 0))
+            cells.append(f"{both}, {control} of {of}" if of else "–")
+        print(f"| {' | '.join([*place_names(place), *cells])} |")
+    print(
+        "\nLevels at which all runs together decide that the prior is below Stage 1 and control, "
+        "and below the\ncontrol: the 95 % interval of that level alone holds no zero.\n"
+    )
 
-    Args:
-        tables: the effects of each run.
-        seeds: how many seeds, and so data, the runs have.
-        chance: standard deviation over trainings that each interval holds, in percent.
-    """
-    rows = pd.concat([table[table["condition"] == CLEAN] for table in tables])
-    variance = ((rows["high"] - rows["low"]) / (2 * 1.96)) ** 2
-    rows = rows.assign(pairs=(variance - chance**2).clip(lower=0))
-    groups = rows.groupby(KEYS, sort=False)
-    count = groups.size()
-    # A missing interval of one run leaves the joint one missing.
-    of_pairs = groups["pairs"].agg(lambda x: x.mean(skipna=False)) / seeds
-    own = 1.96 * np.sqrt(of_pairs + chance**2 / count)
-    between = stats.t.ppf(0.975, count - 1) * groups["relative"].std(ddof=1) / np.sqrt(count)
-    half = np.maximum(own, between)
-    mean = groups["relative"].mean()
-    return pd.DataFrame({"mean": mean, "low": mean - half, "high": mean + half})
+
+def of_both(tables: Iterable[Iterable[pd.DataFrame]], found: list[Finished]) -> list[pd.DataFrame]:
+    """The effects of all runs joined, to each reference that ``tables`` hold of a run."""
+    seeds = len({run.made["seed"] for run in found})
+    spread = max(spread_under(run.spread, CLEAN) for run in found)
+    clean = [[table[table["condition"] == CLEAN] for table in each] for each in tables]
+    return [joined(each, KEYS, seeds=seeds, spread=spread) for each in zip(*clean, strict=True)]
+
+
+def lower(joint: list[pd.DataFrame], key: tuple) -> bool:
+    return all(table.loc[key, "high"] < 0 for table in joint)
 
 
 def heading(first: str, others: Iterable[str]) -> None:
