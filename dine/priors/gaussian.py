@@ -239,9 +239,11 @@ class Posterior:
         energy: half the squared length of both, −log of the prior's density up to a constant.
         complexity: half the log-determinant of the posterior precision relative to the prior's;
             −log evidence is misfit + energy + complexity (MacKay, 1992, Bayesian interpolation).
+        evidence: log evidence of what was observed, up to a constant that priors of one mean share.
     """
 
     def __init__(self, prior: LinearGaussian, pulled: np.ndarray, precision: np.ndarray):
+        self._observed = pulled, precision
         modes, kernel = prior.modes, prior.kernel
         first, rank = len(modes), kernel.shape[1]
         size = first + 3 * rank
@@ -276,6 +278,11 @@ class Posterior:
             self.mean += np.tensordot(self.shared, prior.modes, axes=1)
         self.energy = 0.5 * float((found**2).sum())
         self.complexity = float(np.log(np.diag(self._factor[0])).sum())
+        self.evidence = 0.5 * float(right @ found) - self.complexity
+
+    def under(self, prior: LinearGaussian) -> Posterior:
+        """What the same observations say under another prior of the same points."""
+        return Posterior(prior, *self._observed)
 
     @cached_property
     def determined(self) -> float:

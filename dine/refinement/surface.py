@@ -16,7 +16,7 @@ symmetric objective function for ICP). All lengths are in the normalised frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -113,6 +113,8 @@ _TO_DEVIATION = 1.4826
 _SETTLING_ROUNDS = 3
 _COARSEST = 0.05
 _SCALES = (0.1, 1.0)
+# Of the scale under one prior, about what is left under the next finer one.
+_FINER_SCALE = 0.6
 _FOLLOWED = 0.8
 # How far off planes are between the points of a cloud, for each square of their median distance: as
 # on spheres of radius 0.08 half way between points twice as far apart.
@@ -191,6 +193,8 @@ class OnSurface(NamedTuple):
         source: which of the source's points lie on the target.
         target: which of the target's points, of those that look for the source, lie on it.
         scale: the posterior's prior has so many times the standard deviations of the one given.
+        finer: how many of the finer priors were taken, one after the other; the last of them, times
+            ``scale``, is the posterior's.
     """
 
     posterior: Posterior
@@ -198,6 +202,7 @@ class OnSurface(NamedTuple):
     source: Coverage
     target: Coverage
     scale: float = 1.0
+    finer: int = 0
 
 
 def refine_on_surface(
@@ -207,6 +212,7 @@ def refine_on_surface(
     prior: LinearGaussian,
     options: SurfaceOptions = DEFAULTS,
     guides: Guides = NO_GUIDES,
+    finer: Iterable[LinearGaussian] = (),
 ) -> OnSurface:
     """The field after some rounds.
 
@@ -214,7 +220,8 @@ def refine_on_surface(
     to the same, on fewer points; the most probable of them goes on on all. Where the matches are
     more probable if nothing but the prior's mean happened, that is kept: what is left then follows
     from where points happened to be drawn. Otherwise what is found may settle: see
-    :class:`SurfaceOptions`.
+    :class:`SurfaceOptions`. Once settled, it goes on under each of the finer priors in turn as long
+    as these make it more probable.
 
     Args:
         source: points spread evenly.
@@ -223,6 +230,7 @@ def refine_on_surface(
         prior: of fields there.
         options: how many rounds, and of what.
         guides: observed as they are, in every round.
+        finer: further priors of the same mean, asked for one by one; of meshes only.
     """
     # Neither noise nor what planes through neighbours miss of a curved surface is to be followed.
     some = spread(len(target.surface.points), _ROUGHNESS_POINTS)
@@ -238,15 +246,18 @@ def refine_on_surface(
         end = search.posterior(start, prior, np.geomspace(between, last, options.rounds))
         improbability = search.observed(end.mean, last)[2] + end.energy + end.complexity
         _, precision, misfit = search.observed(prior.mean, last)
-        scale = 1.0
+        scale, taken = 1.0, 0
         if misfit < improbability:
             still = np.einsum("nab,nb->na", precision, prior.mean)
             end, improbability = Posterior(prior, still, precision), misfit
         elif options.settling:
             # Settled fields, each judged by what it says itself, could not be compared.
             known = [x.measured for x in (source, target) if x.measured is not None]
-            end, scale, last = search.settled(end, prior, last, min(known, default=None))
-    return OnSurface(end, improbability, *search.coverage(end.mean, last), scale)
+            count = min(known, default=None)
+            end, scale, last = search.settled(end, prior, last, count)
+            if not search.from_cloud:
+                end, scale, last, taken = search.finer(end, finer, scale, last, count)
+    return OnSurface(end, improbability, *search.coverage(end.mean, last), scale, taken)
 
 
 def _fields(
@@ -332,7 +343,12 @@ class _Search:
         return Posterior(prior, *self.observed(field, schedule[-1])[:2])
 
     def settled(
-        self, found: Posterior, prior: LinearGaussian, deviation: float, measured: int | None
+        self,
+        found: Posterior,
+        prior: LinearGaussian,
+        deviation: float,
+        measured: int | None,
+        scale: float = 1.0,
     ) -> tuple[Posterior, float, float]:
         """What comes of a posterior if the standard deviation across the surface and the prior's
         scale are those that it makes most likely itself; with the scale and the deviation.
@@ -341,7 +357,7 @@ class _Search:
         many were drawn (MacKay, 1992, Bayesian interpolation, section 4). Of clouds the deviation
         stays: it stands for planes that are wrong, which points of the same planes do not tell.
         """
-        options, scale = self.options, 1.0
+        options = self.options
         matches = 2 * len(self.source.points)
         count = matches if measured is None else min(measured, matches)
         for _ in range(options.settling):
@@ -353,6 +369,31 @@ class _Search:
             schedule = np.full(_SETTLING_ROUNDS, deviation)
             found = self.posterior(found.mean, prior.times(scale), schedule)
         return found, scale, deviation
+
+    def finer(
+        self,
+        found: Posterior,
+        priors: Iterable[LinearGaussian],
+        scale: float,
+        deviation: float,
+        measured: int | None,
+    ) -> tuple[Posterior, float, float, int]:
+        """What comes of a settled posterior under priors that let more happen within short
+        distances; with the scale, the deviation, and how many priors were taken.
+
+        Compared by the evidence of the very observations that the field settled with (MacKay, 1992,
+        section 3). Of clouds it would say how wrong their planes are.
+        """
+        taken = 0
+        for prior in priors:
+            # What a finer prior adds to the length of short motions, its scale has to take back.
+            smaller = max(_FINER_SCALE * scale, _SCALES[0])
+            other = found.under(prior.times(smaller))
+            if other.evidence <= found.evidence:
+                break
+            taken += 1
+            found, scale, deviation = self.settled(other, prior, deviation, measured, smaller)
+        return found, scale, deviation, taken
 
     def _left_across(self, field: np.ndarray, deviation: float) -> float:
         """Standard deviation of the distance across the surface that a field (N + E + L, 3) leaves,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -26,7 +27,7 @@ from dine.geometry.oriented import (
 from dine.geometry.surface import Surface
 from dine.priors.gaussian import CovarianceRoot, LinearGaussian
 from dine.progress import stage
-from dine.refinement.process import STIFF_AND_BENT, STIFFER, SURFACE
+from dine.refinement.process import FINER, STIFF_AND_BENT, STIFFER, SURFACE
 from dine.refinement.surface import (
     NO_GUIDES,
     OnSurface,
@@ -138,8 +139,14 @@ def refined_on_surfaces(
     moving, fixed = _outlines(pair, settings, detail)
     guides = settings.guide.within(pair.alignment) if settings.guide else NO_GUIDES
     places = np.vstack([moving.places, guides.places])
-    root = SURFACE._replace(rank=detail.rank).fitted(places)
+
+    @functools.cache
+    def root_of(number: int) -> CovarianceRoot:
+        return (SURFACE, *FINER)[number]._replace(rank=detail.rank).fitted(places)
+
+    root = root_of(0)
     prior = LinearGaussian.of_kernel(root.root)
+    finer = (LinearGaussian.of_kernel(root_of(n).root) for n in range(1, 1 + len(FINER)))
     starts = [np.zeros_like(places)]
     if found.field.any():
         starts.insert(0, root.root @ _fitted(root.at(found.start), found.field))
@@ -154,8 +161,8 @@ def refined_on_surfaces(
             field = rough.posterior.mean
             starts.append(root.root @ _fitted(root.root, field))
         options = replace(options, firsts=_GOING_ON)
-    end = refine_on_surface(moving, fixed, starts, prior, options, guides)
-    posterior, root = end.posterior, root.times(end.scale)
+    end = refine_on_surface(moving, fixed, starts, prior, options, guides, finer)
+    posterior, root = end.posterior, root_of(end.finer).times(end.scale)
     anywhere = ProcessField(root, posterior.alone)
     # What the surfaces leave open, the larger the more moved: none of it if nothing did.
     deviation = posterior.scale * np.sqrt(posterior.variance(root.at(found.start)))
@@ -223,6 +230,8 @@ def improbabilities(pairs: Sequence[Pair], settings: Settings, detail: Detail) -
     )
     none = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
     options = _rough(_options(settings.overlap), _ROUGHLY[0][1], detail.rounds, detail.last)
+    # What settles afterwards changes no improbability.
+    options = replace(options, settling=0)
     found = []
     for pair in pairs:
         normals = source.normals @ pair.alignment.matrix[:3, :3].T

@@ -1,6 +1,7 @@
 """Refinement against surfaces: on what is known to be the answer, and within registrations."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from dine.geometry.oriented import Curve, OrientedPoints, evenly
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_surface
-from dine.refinement.process import SURFACE
+from dine.refinement.process import FINER, SURFACE
 from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
 from dine.registration import correspondence
 from dine.registration.assessment import mirrored
@@ -186,6 +187,52 @@ def test_a_field_settles_as_noise_and_its_own_size_allow(noise):
     # The prior allows motions ten times as large.
     assert 0.1 <= found.scale < 0.4
     assert errors[1] < 0.7 * errors[0]
+
+
+@pytest.mark.parametrize("finely", [False, True])
+def test_finer_processes_are_taken_where_things_move_more_finely(finely):
+    """As a face does, of which the mouth moves and the cheek beside it does not."""
+    rng = np.random.default_rng(0)
+    here = oriented_points(organ(), 8000, rng)
+    here = here.at(evenly(here.points, 2000))
+    other = organ(40.0, subdivisions=5)
+    move = twitch if finely else functools.partial(bend, size=0.05)
+    seen = Surface(other.vertices + move(other.vertices), other.faces)
+    outlines = (
+        Outline(here, NO_CURVE),
+        Outline(oriented_points(seen, 20_000, rng), NO_CURVE, measured=len(seen.vertices)),
+    )
+    truth, asked = move(here.points), []
+
+    def finer():
+        for process in FINER:
+            asked.append(process)
+            yield process.at(here.points)
+
+    none, some = (
+        refine_on_surface(
+            *outlines, [np.zeros_like(truth)], SURFACE.at(here.points), settled, finer=further
+        )
+        for settled in [SurfaceOptions(settling=3)]
+        for further in ((), finer())
+    )
+    before, after = (mean_error(x.posterior.mean, truth) for x in (none, some))
+    assert none.finer == 0
+    if finely:
+        assert some.finer > 0
+        assert after < 0.9 * before
+    else:
+        # The next one is asked, and refused; nothing else follows.
+        assert (some.finer, len(asked)) == (0, 1)
+        assert after == before
+
+
+def twitch(points):
+    """A field (N, 3) that is large in some small places and nothing between them."""
+    centres = organ(subdivisions=2).vertices[::8]
+    away = ((points[:, None] - centres) ** 2).sum(axis=2)
+    push = np.random.default_rng(1).normal(0, 0.03, centres.shape)
+    return np.exp(-away / (2 * 0.15**2)) @ push
 
 
 def bend(points, size):

@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.linalg import block_diag
 
 from dine.priors.gaussian import (
     LinearGaussian,
@@ -126,6 +128,25 @@ def test_a_posterior_is_that_of_linear_regression(kernel, modes):
     assert found.energy == pytest.approx(0.5 * (amplitudes**2).sum())
     variances = np.diag(design @ covariance @ design.T).reshape(-1, 3).sum(axis=1)
     assert np.allclose(found.variance(prior.kernel, prior.modes), variances)
+
+
+@pytest.mark.parametrize("modes", [0, 3])
+def test_evidence_tells_priors_apart_as_the_density_of_what_was_seen(modes):
+    prior, _, precision = observed(modes=modes)
+    precision += np.eye(3)
+    seen = prior.mean + cloud(len(prior.mean))
+    pulled = np.einsum("nab,nb->na", precision, seen)
+    noise = block_diag(*np.linalg.inv(precision))
+    first = Posterior(prior, pulled, precision)
+    said, density = [first.evidence], []
+    for factor in (1.0, 0.5, 3.0):
+        said.append(first.under(prior.times(factor)).evidence)
+        design = dense(prior.times(factor))
+        covariance = design @ design.T + noise
+        found = stats.multivariate_normal(prior.mean.ravel(), covariance).logpdf(seen.ravel())
+        density.append(found)
+    assert said[0] == pytest.approx(said[1])
+    assert np.allclose(np.diff(said[1:]), np.diff(density))
 
 
 @pytest.mark.parametrize("modes", [0, 3])
