@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import trimesh
-from surfaces import Pair, conditions, radius
+from known_pairs import Pair, conditions, radius
 from threadpoolctl import threadpool_limits
 
 from dine.classical.bcpd import Parameters, bcpd

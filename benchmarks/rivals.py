@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from registrations import deformed_copies, real_pairs
+from known_pairs import deformed_copies, real_pairs
 
 from dine.classical.methods import CLASSICAL
 from dine.data.sampling import sample_surface

@@ -17,118 +17,14 @@ from __future__ import annotations
 
 import argparse
 import time
-import zlib
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import fast_simplification
 import numpy as np
 import torch
-from registrations import bent_copies, deformed_copies, real_pairs
+from known_pairs import conditions, radius
 
-from dine.data.sampling import sample_surface
-from dine.geometry.surface import Surface
 from dine.registration.model import load_model
 from dine.registration.register import register
-
-Pair = tuple[str, Surface, Surface, np.ndarray]
-KEPT_FACES = 0.55
-
-
-def remeshed(surface: Surface, kept: float = KEPT_FACES) -> Surface:
-    """With other vertices and fewer faces."""
-    vertices, faces = fast_simplification.simplify(
-        surface.vertices.astype(np.float32), surface.faces.astype(np.int32), 1 - kept
-    )
-    return Surface(vertices, faces, surface.name)
-
-
-def radius(surface: Surface) -> float:
-    return float(np.linalg.norm(surface.vertices - surface.vertices.mean(axis=0), axis=1).max())
-
-
-def with_noise(surface: Surface, rng: np.random.Generator) -> Surface:
-    moved = surface.vertices + 0.01 * radius(surface) * rng.normal(size=surface.vertices.shape)
-    return Surface(moved, surface.faces, surface.name)
-
-
-def with_hole(surface: Surface, rng: np.random.Generator) -> Surface:
-    """Without the 15 % of its faces that are nearest to one of them."""
-    middles = surface.vertices[surface.faces].mean(axis=1)
-    distance = np.linalg.norm(middles - middles[rng.integers(len(middles))], axis=1)
-    return part(surface, distance > np.quantile(distance, 0.15))[0]
-
-
-def part(surface: Surface, faces: np.ndarray) -> tuple[Surface, np.ndarray]:
-    """The given faces (F,) alone, and the vertices that remain."""
-    used, index = np.unique(surface.faces[faces], return_inverse=True)
-    return Surface(surface.vertices[used], index.reshape(-1, 3), surface.name), used
-
-
-def as_clouds(pairs: Iterator[Pair], count: int) -> Iterator[Pair]:
-    for name, source, target, truth in pairs:
-        rng = np.random.default_rng(zlib.crc32(name.encode()))
-        ours = sample_surface(source, count, rng)
-        places = ours.places(source.vertices)
-        other = sample_surface(target, count, rng).places(target.vertices)
-        yield name, Surface(places), Surface(other), ours.places(truth)
-
-
-def both_partial(pairs: Iterator[Pair], seen: float) -> Iterator[Pair]:
-    """Each shows a share of the faces, from opposite ends of the longest axis.
-
-    The truth of vertices that the target does not show is NaN.
-    """
-    for name, source, _, truth in pairs:
-        middles = source.vertices[source.faces].mean(axis=1)
-        axis = np.linalg.svd(middles - middles.mean(axis=0), full_matrices=False)[2][0]
-        along = middles @ axis
-        ours, used = part(source, along < np.quantile(along, seen))
-        theirs, shown = part(Surface(truth, source.faces), along > np.quantile(along, 1 - seen))
-        known = np.full_like(truth, np.nan)
-        known[shown] = truth[shown]
-        yield name, ours, remeshed(theirs), known[used]
-
-
-def changed(pairs: Iterator[Pair], *changes: Callable[..., Surface]) -> Iterator[Pair]:
-    """Targets after some changes, in which the truth stays what it was."""
-    for name, source, target, truth in pairs:
-        rng = np.random.default_rng(zlib.crc32(name.encode()))
-        for change in changes:
-            target = change(target) if change is remeshed else change(target, rng)
-        yield name, source, target, truth
-
-
-def conditions(meshes: Path, half: str | None) -> dict[str, Iterator[Pair]]:
-    names = [path.stem for path in sorted((meshes / "objects").glob("*.ply"))]
-    only = {None: names, "tuned": names[::2], "kept": names[1::2]}[half]
-
-    def copies(level: float = 0.4) -> Iterator[Pair]:
-        return deformed_copies(meshes / "objects", set(only), level)
-
-    def bent() -> Iterator[Pair]:
-        found = bent_copies(meshes / "objects", 150)
-        return (pair for pair in found if pair[0] in only)
-
-    def real(word: str) -> Iterator[Pair]:
-        found = real_pairs(meshes / "pairs")
-        return (pair for pair in found if word in pair[0] and "partial" not in pair[0])
-
-    return {
-        "remeshed": changed(copies(), remeshed),
-        "noise 1 %": changed(copies(), remeshed, with_noise),
-        "hole 15 %": changed(copies(), remeshed, with_hole),
-        "level 0.8": changed(copies(0.8), remeshed),
-        "bent 150": changed(bent(), remeshed),
-        "clouds of 1024": as_clouds(copies(), 1024),
-        "clouds of 4096": as_clouds(copies(), 4096),
-        "clouds of 16384": as_clouds(copies(), 16384),
-        "both partial 80 %": both_partial(copies(), 0.8),
-        "itself": ((name, source, source, source.vertices) for name, source, _, _ in copies()),
-        "faces": changed(real("face"), remeshed),
-        "liver": changed(real("liver 1"), remeshed),
-        "hippocampus": changed(real("hippocampus"), remeshed),
-    }
 
 
 def main() -> None:
