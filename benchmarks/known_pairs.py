@@ -15,13 +15,17 @@ import numpy as np
 
 from dine.data.deformation import rbf_displacement
 from dine.data.sampling import sample_surface
+from dine.geometry.distance import distances
+from dine.geometry.rigid import rigid_alignments, transformed
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
+from dine.registration.assessment import mirrored
 
 Pair = tuple[str, Surface, Surface, np.ndarray | None]
 RECIPE = {"control_percent": 5, "width": 0.4, "amplitude": 0.15, "points": 1024}
 LEVEL = 0.4
 KEPT_FACES = 0.55
+AS_NEAR = 1.15
 
 
 def deformed_copies(
@@ -64,10 +68,27 @@ def other_objects(folder: Path) -> Iterator[Pair]:
 
 
 def mirrored_copies(folder: Path, level: float = 0.2) -> Iterator[Pair]:
-    """Deformed copies with the sign of one coordinate changed, so that no place is right."""
+    """Deformed copies with the sign of one coordinate changed, so that no place is right; not of
+    symmetric objects, which are what they are either way."""
     for name, source, target, _ in deformed_copies(folder, level=level):
-        flipped = Surface(target.vertices * [-1, 1, 1], target.faces[:, ::-1], target.name)
-        yield name, source, flipped, None
+        if not symmetric(source):
+            yield name, source, mirrored(target), None
+
+
+def symmetric(surface: Surface) -> bool:
+    """Whether points of the mirror image lie nearly as near to points of the surface as others of
+    its own do."""
+    rng = np.random.default_rng(0)
+    points, others = (sample_surface(surface, 1000, rng).places(surface.vertices) for _ in range(2))
+    image = others * [-1, 1, 1]
+    nearest = min(
+        _apart(transformed(image, motion), points) for motion in rigid_alignments(image, points)
+    )
+    return nearest < AS_NEAR * _apart(others, points)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    return float(distances(a, b).mean() + distances(b, a).mean())
 
 
 def real_pairs(folder: Path) -> Iterator[Pair]:

@@ -407,6 +407,21 @@ def test_a_mirror_image_is_told(pair, flipped):
         assert result.trust.verdict != "plausible"
 
 
+@pytest.mark.parametrize("flipped", [True, False])
+def test_a_mirror_image_is_told_of_what_is_nearly_symmetric(flipped):
+    """Rigidly it lies as well on one side as on the other."""
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    vertices = np.asarray(ball.vertices)
+    reach = np.ones(len(vertices))
+    for direction, height in (((0, 1, 0.3), 0.8), ((0, -0.5, 1), 0.5), ((0.8, 0.2, 0.5), 0.2)):
+        along = vertices @ (np.array(direction) / np.linalg.norm(direction))
+        reach += height * np.exp(-(1 - along) / 0.3**2)
+    source = Surface(vertices * reach[:, None] * [0.6, 0.5, 0.4], np.asarray(ball.faces))
+    target = Surface(bent(source.vertices), source.faces)
+    result = dine.register(source, mirrored(target) if flipped else target)
+    assert any("mirror image" in reason for reason in result.trust.reasons) == flipped
+
+
 def test_a_symmetric_object_is_no_mirror_image_of_itself():
     ball = trimesh.creation.icosphere(subdivisions=4)
     source = Surface(np.asarray(ball.vertices) * [1.0, 0.7, 0.5], np.asarray(ball.faces))
