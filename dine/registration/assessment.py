@@ -45,8 +45,8 @@ _LYING_ON = 0.03
 # What the mirrored source lowers the improbability to, if the target is its mirror image: 0.25 to
 # 0.78 of real shapes that are flipped and not symmetric, not below 0.9 of any that are not flipped.
 _MIRROR_FITS = 0.85
-# At how many times the mean distance of rigidly aligned points it is looked at more closely: what is
-# nearly symmetric aligns as well either way, and tells only when it is bent.
+# At how many times the mean distance of rigidly aligned points it is looked at more closely: what
+# is nearly symmetric aligns as well either way, and tells only when it is bent.
 _MIRROR_NEARER = 1.1
 _ACROSS = np.array([-1.0, 1.0, 1.0])
 
@@ -253,7 +253,7 @@ def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> boo
     easily than the fields of a registration do. Symmetric objects fit as well either way.
     """
     near = np.linalg.norm(found.field, axis=1).mean() < _LYING_ON
-    if near or found.improbability is None or settings.overlap is not Overlap.AUTO:
+    if near or found.improbability is None or found.overlap is not Overlap.AUTO:
         return False
     places, seen = pair.places, pair.alignment.restore(pair.goal)
     nearest = _MIRROR_NEARER * _apart(pair.alignment.align(places), seen)
