@@ -23,6 +23,7 @@ error is above 95 % of that of rigid alignment alone, or above 15 %, and where n
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,15 +47,21 @@ from dine.registration.types import Model
 
 
 def verdict_pairs(objects: Path, case: str) -> Iterator[Pair]:
-    if case == "other":
-        return other_objects(objects)
-    if case == "mirrored":
-        return mirrored_copies(objects)
-    if case.startswith("parts-"):
-        return both_partial(deformed_copies(objects), float(case.removeprefix("parts-")))
-    if case.startswith("bent-"):
-        return bent_copies(objects, float(case.removeprefix("bent-")))
-    return deformed_copies(objects, level=float(case))
+    kind, _, number = case.rpartition("-")
+    try:
+        if case == "other":
+            return other_objects(objects)
+        if case == "mirrored":
+            return mirrored_copies(objects)
+        if kind == "parts":
+            return both_partial(deformed_copies(objects), float(number))
+        if kind == "bent":
+            return bent_copies(objects, float(number))
+        return deformed_copies(objects, level=float(case))
+    except ValueError:
+        sys.exit(
+            f"--verdicts got {case!r}; expected levels, bent-DEGREES, other, mirrored, parts-SHARE."
+        )
 
 
 def count_verdicts(objects: Path, cases: list[str], model: Model) -> None:

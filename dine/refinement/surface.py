@@ -113,9 +113,9 @@ _TO_DEVIATION = 1.4826
 _SETTLING_ROUNDS = 3
 _COARSEST = 0.05
 _SCALES = (0.1, 1.0)
+_FOLLOWED = 0.8
 # Of the scale under one prior, about what is left under the next finer one.
 _FINER_SCALE = 0.6
-_FOLLOWED = 0.8
 # How far off planes are between the points of a cloud, for each square of their median distance: as
 # on spheres of radius 0.08 half way between points twice as far apart.
 _OFF_BETWEEN = 24.0

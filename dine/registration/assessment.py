@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dine.geometry.distance import distances, spacings, surface_distance
+from dine.geometry.distance import spacings, surface_distance
 from dine.geometry.interpolation import FittedValues
 from dine.geometry.rigid import Alignment, rigid_alignments, transformed
 from dine.geometry.surface import Surface
@@ -271,4 +271,4 @@ def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> boo
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:
     """Mean distance of (N, 3) points to the nearest of (M, 3) others, and of these to those."""
-    return float(distances(a, b).mean() + distances(b, a).mean())
+    return surface_distance(a, b)["chamfer_unsquared"]

@@ -214,7 +214,9 @@ def _measured(surface: Surface) -> tuple[int, float]:
 def _rough(
     options: SurfaceOptions, first: float, rounds: int, end: float = _ROUGH_END
 ) -> SurfaceOptions:
-    return replace(options, firsts=(first,), between=end, last=end, rounds=rounds)
+    # What settles afterwards changes no improbability, and no field that is only a start.
+    ends = {"firsts": (first,), "between": end, "last": end}
+    return replace(options, **ends, rounds=rounds, settling=0)
 
 
 def improbabilities(pairs: Sequence[Pair], settings: Settings, detail: Detail) -> list[float]:
@@ -230,8 +232,6 @@ def improbabilities(pairs: Sequence[Pair], settings: Settings, detail: Detail) -
     )
     none = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
     options = _rough(_options(settings.overlap), _ROUGHLY[0][1], detail.rounds, detail.last)
-    # What settles afterwards changes no improbability.
-    options = replace(options, settling=0)
     found = []
     for pair in pairs:
         normals = source.normals @ pair.alignment.matrix[:3, :3].T
