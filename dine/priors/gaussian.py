@@ -300,6 +300,16 @@ class Posterior:
         """
         return float(np.sqrt(2 * self.energy / max(self.determined, 1.0)))
 
+    def saving(self, least: float) -> float:
+        """What −log of the evidence falls by if the prior's scale is not known: that which is most
+        likely of its field is taken, at least ``least`` and at most 1.
+
+        Shrunk by s, the energy grows by 1 / s² and log(1 / s) is won for each amplitude that the
+        data determine (MacKay, 1992, Bayesian interpolation, section 4.3).
+        """
+        scale = float(np.clip(self.scale, least, 1.0))
+        return self.energy * (1 - scale**-2) - self.determined * float(np.log(scale))
+
     def covariance(self, kernel: np.ndarray, modes: np.ndarray | None = None) -> np.ndarray:
         """(M, 3, 3) of the field where the prior has these rows of its kernel (M, r), and modes
         (R, M, 3) if it has any."""

@@ -189,7 +189,8 @@ class OnSurface(NamedTuple):
 
     Attributes:
         posterior: of the last round.
-        improbability: −log of its evidence: misfit + energy + complexity.
+        improbability: −log of its evidence: misfit + energy + complexity; of parts, that under the
+            scale of the prior which makes it least.
         source: which of the source's points lie on the target.
         target: which of the target's points, of those that look for the source, lie on it.
         scale: the posterior's prior has so many times the standard deviations of the one given.
@@ -250,13 +251,17 @@ def refine_on_surface(
         if misfit < improbability:
             still = np.einsum("nab,nb->na", precision, prior.mean)
             end, improbability = Posterior(prior, still, precision), misfit
-        elif options.settling:
-            # Settled fields, each judged by what it says itself, could not be compared.
-            known = [x.measured for x in (source, target) if x.measured is not None]
-            count = min(known, default=None)
-            end, scale, last = search.settled(end, prior, last, count)
-            if not search.from_cloud:
-                end, scale, last, taken = search.finer(end, finer, scale, last, count)
+        else:
+            if options.parts:
+                # Parts laid wrongly on each other fit as well, but only if they are bent more.
+                improbability -= end.saving(_SCALES[0])
+            if options.settling:
+                # Settled fields, each judged by what it says itself, could not be compared.
+                known = [x.measured for x in (source, target) if x.measured is not None]
+                count = min(known, default=None)
+                end, scale, last = search.settled(end, prior, last, count)
+                if not search.from_cloud:
+                    end, scale, last, taken = search.finer(end, finer, scale, last, count)
     return OnSurface(end, improbability, *search.coverage(end.mean, last), scale, taken)
 
 

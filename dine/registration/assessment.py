@@ -113,10 +113,12 @@ def measure(
     if correspondence.inconsistency is not None:
         checks["inconsistency"] = correspondence.inconsistency
     if expected is not None:
-        moved_by = float(np.linalg.norm(correspondence.field, axis=1).mean())
-        scale = pair.alignment.frame.scale
-        checks["uncertain"] = expected.mean / (max(moved_by, _SMALL) * scale)
-        checks["unsure"] = expected.mean / scale
+        # What the target does not show is not held against the rest.
+        seen = correspondence.supported | ~correspondence.supported.any()
+        moved_by = float(np.linalg.norm(correspondence.field[seen], axis=1).mean())
+        unsure = float(expected.points[seen].mean()) / pair.alignment.frame.scale
+        checks["uncertain"] = unsure / max(moved_by, _SMALL)
+        checks["unsure"] = unsure
     if correspondence.unmet is not None:
         checks["unmet"] = correspondence.unmet
     # Where points come in another order than the prior's, it says nothing of their field.
@@ -160,10 +162,10 @@ def assess(
 
     ``checks`` need no validation pairs: ``remaining``, the Chamfer distance that is left, as a
     share of that before (after rigid alignment); ``uncertain``, the expected error as a share
-    of the displacement (of a hundredth of the radius at least), means of both;
-    ``unsure``, the mean expected error (normalised); ``unmet``, the share of the surface that lies
-    on none of the other scan's; ``inconsistency``, how far points end up from where they began
-    (mean, normalised) when registered to the target and back.
+    of the displacement (of a hundredth of the radius at least), means of both over what the target
+    shows; ``unsure``, that mean expected error (normalised); ``unmet``, the share of the surface
+    that lies on none of the other scan's; ``inconsistency``, how far points end up from where they
+    began (mean, normalised) when registered to the target and back.
 
     ``notes`` speak against the result, ``remarks`` do not.
     """

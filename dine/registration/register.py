@@ -25,8 +25,8 @@ from dine.registration.assessment import (
     looks_mirrored,
     measure,
 )
-from dine.registration.correspondence import correspondence_of
 from dine.registration.model import load_model
+from dine.registration.overlap import correspondence_of
 from dine.registration.shapes import (
     POINTS,
     Points,
@@ -52,6 +52,10 @@ from dine.threads import together
 
 # Share of the source without counterpart that is more than a rim.
 _WORTH_SAYING = 0.02
+_RIVAL = (
+    "Another way to lay the scans on each other explains them about as well; check that the moved "
+    "source lies the right way round, or align the scans first."
+)
 
 if TYPE_CHECKING:
     from dine.priors.organ import OrganPrior
@@ -196,7 +200,8 @@ def _registered(
     notes = check_sizes(source, target, settings.overlap is not Overlap.AUTO)
     pair, correspondence = correspondence_of(source, target, model, settings)
     stage("measures")
-    notes += _parts(settings, correspondence)
+    if correspondence.rival:
+        notes.append(_RIVAL)
     motion = Motion(pair.alignment, correspondence.interpolated())
     calibration = model.calibration_for(settings, correspondence.overlap)
     mirrored, (moved, expected, measures) = together(
@@ -212,7 +217,7 @@ def _registered(
         expected and expected.mean,
         checks=measures.checks,
         notes=tuple(notes),
-        remarks=_support(correspondence),
+        remarks=(*_parts(settings, correspondence), *_support(correspondence)),
     )
     report = _report(pair, correspondence, displacement, measures, trust, model)
     report["settings"] = settings.described(len(pair.start))
@@ -250,14 +255,11 @@ def _measured(
     return moved, expected, measure(pair, correspondence, motion, model, settings, expected)
 
 
-def _parts(settings: Settings, correspondence: Correspondence) -> list[str]:
+def _parts(settings: Settings, correspondence: Correspondence) -> tuple[str, ...]:
     """What to say where parts turned out to be missing."""
     if settings.overlap is correspondence.overlap or settings.overlap is not Overlap.AUTO:
-        return []
-    return [
-        "Both scans seem to show what the other does not, so they were registered as parts that "
-        "overlap; how far such results are off is not calibrated."
-    ]
+        return ()
+    return ("A scan seems to show what the other does not: they were registered as parts.",)
 
 
 def _support(correspondence: Correspondence) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ _DRAWN = 4
 _COARSE_ERROR = 0.01
 # Where scans overlap: what points beyond the other's end cost, against others without counterpart;
 # how stiff fields are found, each from the one before; and how the search goes on from these.
-_MISSING = 0.2
+_MISSING = 0.06
 _ROUGHLY = ((STIFFER, 0.2, 15), (STIFF_AND_BENT, 0.15, 10))
 _ROUGH_END = 0.05
 _GOING_ON = (0.08, 0.04)
@@ -53,8 +53,6 @@ _GOING_ON = (0.08, 0.04)
 _SMOOTHED = 24
 _NOISY = 0.94
 _LOOKED_AT = 2000
-# How often, of whole scans, their noise and the scale of the prior are estimated at the end.
-_SETTLING = 3
 
 
 class Detail(NamedTuple):
@@ -66,6 +64,7 @@ class Detail(NamedTuple):
         rank: of the process.
         rounds: for each part of the search.
         last: the least standard deviation across the surface.
+        settling: how often, at the end, noise and the scale of the prior are estimated.
     """
 
     source: int = 2000
@@ -73,13 +72,14 @@ class Detail(NamedTuple):
     rank: int = SURFACE.rank
     rounds: int = SurfaceOptions.rounds
     last: float = SurfaceOptions.last
+    settling: int = 3
 
 
 FULL = Detail()
 # Which of several alignments are worth more.
-QUICK = Detail(400, 2000, 120, 8, 0.02)
+QUICK = Detail(400, 2000, 120, 8, 0.02, 0)
 # Whether a mirror image fits better.
-CLOSE = Detail(500, 2500, STIFFER.rank, 8, 0.02)
+CLOSE = Detail(500, 2500, STIFFER.rank, 8, 0.02, 0)
 
 
 @dataclass(frozen=True)
@@ -150,10 +150,10 @@ def refined_on_surfaces(
     starts = [np.zeros_like(places)]
     if found.field.any():
         starts.insert(0, root.root @ _fitted(root.at(found.start), found.field))
-    options = replace(_options(settings.overlap), rounds=detail.rounds, last=detail.last)
+    options = _options(settings.overlap, detail)
     if settings.overlap is Overlap.BOTH:
         # Of parts, a loose field would make wholes of each other: first, some that hardly bend.
-        field, starts = starts[0], []
+        field, starts = starts[0], starts[:-1]
         for process, first, rounds in _ROUGHLY:
             stiff = LinearGaussian.of_kernel(process.fitted(places).root)
             roughly = _rough(options, first, rounds)
@@ -231,7 +231,7 @@ def improbabilities(pairs: Sequence[Pair], settings: Settings, detail: Detail) -
         )
     )
     none = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
-    options = _rough(_options(settings.overlap), _ROUGHLY[0][1], detail.rounds, detail.last)
+    options = _rough(_options(settings.overlap, detail), _ROUGHLY[0][1], detail.rounds, detail.last)
     found = []
     for pair in pairs:
         normals = source.normals @ pair.alignment.matrix[:3, :3].T
@@ -244,9 +244,11 @@ def improbabilities(pairs: Sequence[Pair], settings: Settings, detail: Detail) -
     return found
 
 
-def _options(overlap: Overlap) -> SurfaceOptions:
+def _options(overlap: Overlap, detail: Detail) -> SurfaceOptions:
     return SurfaceOptions(
-        settling=_SETTLING if overlap is Overlap.AUTO else 0,
+        rounds=detail.rounds,
+        last=detail.last,
+        settling=detail.settling if overlap in (Overlap.AUTO, Overlap.BOTH) else 0,
         parts=overlap is Overlap.BOTH,
         missing=_MISSING if overlap is Overlap.BOTH else 1.0,
         source_looks=overlap is not Overlap.TARGET_IN_SOURCE,

@@ -72,12 +72,12 @@ class Model:
     def calibration_for(
         self, settings: Settings, found: Overlap = Overlap.AUTO
     ) -> Calibration | None:
-        """The calibration where it applies: to whole scans, refined as it was made with.
+        """The calibration where it applies: to what is registered as it was made with.
 
-        ``found`` is the overlap that ``auto`` came to.
+        ``found`` is the overlap that ``auto`` came to. Of parts that overlap, the posterior was
+        found to say as much of errors as of wholes; of a part within a whole it is another.
         """
-        whole = settings.overlap is Overlap.AUTO and found is Overlap.AUTO
-        if self.calibration is None or not whole:
+        if self.calibration is None or found not in (Overlap.AUTO, Overlap.BOTH):
             return None
         made = (self.calibration.facts.get("rounds"), self.calibration.facts.get("surfaces", False))
         return self.calibration if made == (settings.rounds, settings.surfaces) else None
@@ -194,6 +194,7 @@ class Correspondence:
             to.
         overlap: as which the scans were registered, ``both`` where ``auto`` found that parts are
             missing.
+        rival: whether another way to lay parts on each other is about as probable.
     """
 
     start: np.ndarray
@@ -207,6 +208,7 @@ class Correspondence:
     unmet: float | None = None
     shown: tuple[float, float] = (1.0, 1.0)
     overlap: Overlap = Overlap.AUTO
+    rival: bool = False
 
     def interpolated(self) -> Callable[[np.ndarray], np.ndarray]:
         """The field as a function of (M, 3) places, normalised frame."""

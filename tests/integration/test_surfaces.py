@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,16 +15,16 @@ from dine.data.sampling import sample_surface
 from dine.errors import DineError
 from dine.files import read_json
 from dine.geometry.oriented import Curve, OrientedPoints, evenly
+from dine.geometry.rigid import Alignment
 from dine.geometry.surface import Surface
 from dine.io.readers import read_surface
 from dine.io.writers import write_surface
 from dine.refinement.process import FINER, SURFACE
 from dine.refinement.surface import Outline, SurfaceOptions, refine_on_surface
-from dine.registration import correspondence
+from dine.registration import overlap
 from dine.registration.assessment import mirrored
-from dine.registration.correspondence import lacks
-from dine.registration.surfaces import oriented_points
-from dine.registration.types import Correspondence, Overlap, Settings
+from dine.registration.surfaces import FULL, oriented_points
+from dine.registration.types import Correspondence, Model, Overlap, Pair, Settings
 
 pytestmark = pytest.mark.numerical
 NO_CURVE = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
@@ -129,29 +130,58 @@ def test_parts_that_overlap_come_to_lie_on_each_other(overlapping, overlap):
     assert 0.6 < result.report["supported"] < 0.9
     assert "no counterpart" in " ".join(result.trust.reasons)
     assert result.report["settings"]["overlap"] == overlap
-    # The calibration is of whole scans; of parts it would promise too much.
     assert result.report["overlap_found"] == "both"
-    assert result.uncertainty is None
-    assert result.trust.verdict == "doubtful"
+    # Where the target shows nothing, more is left open; and only there is it much.
+    shown = result.supported
+    open_there = result.point_uncertainty[~shown].mean()
+    assert open_there > 1.5 * result.point_uncertainty[shown].mean()
+    # Without a rigid alignment the field itself turns, more than any that was validated on.
+    assert result.trust.verdict == ("plausible" if overlap == "auto" else "doubtful")
     assert ("registered as parts" in " ".join(result.trust.reasons)) == (overlap == "auto")
     # Whether a whole is mirrored is not to be told from what only one of them shows.
     assert "mirror image" not in " ".join(result.trust.reasons)
 
 
 @pytest.mark.parametrize(
-    ("shown", "unmet", "parts"),
+    ("shown", "unmet", "of_closed", "of_open"),
     [
-        ((1.0, 0.8), 0.02, False),  # a hole
-        ((0.986, 1.0), 0.01, False),  # the rim of a face
-        ((0.96, 0.97), 0.02, True),
-        ((1.0, 1.0), 0.12, True),
+        ((1.0, 0.8), 0.02, False, True),  # a hole, or a part
+        ((0.99, 1.0), 0.01, False, False),  # the rim of a face
+        ((0.96, 0.97), 0.02, True, True),
+        ((1.0, 1.0), 0.12, True, True),
+        ((1.0, 1.0), None, False, False),
     ],
 )
-def test_parts_are_tried_where_both_scans_lack_something(shown, unmet, parts):
+def test_parts_are_looked_for_where_something_is_lacking(shown, unmet, of_closed, of_open, pair):
     points = np.zeros((1, 3))
     found = Correspondence(points, points, points, None, np.ones(1, bool))
     found = dataclasses.replace(found, shown=shown, unmet=unmet)
-    assert lacks(found) == parts
+    half, _ = cut(pair[0], pair[0].vertices[pair[0].faces[:, 0], 0] > 0)
+    for target, parts in ((pair[1], of_closed), (half, of_open)):
+        scans = Pair(pair[0], target, None, points, points, points)
+        assert overlap.lacks(scans, found) == parts
+
+
+@pytest.mark.parametrize(
+    ("axis", "share", "part"), [(0, 0.8, "source"), (0, 0.8, "target"), (1, 0.6, "target")]
+)
+def test_auto_finds_where_a_part_lies_in_a_whole(axis, share, part):
+    """By their middles and axes they would be laid on each other turned or shifted."""
+    source, other = organ(), organ(40.0)
+    target = Surface(bent(other.vertices), other.faces)
+    truth = bent(source.vertices)
+    whole = source if part == "source" else other
+    along = whole.vertices[whole.faces].mean(axis=1)[:, axis]
+    kept = along < np.quantile(along, share)
+    seen = source.vertices[:, axis] < np.quantile(along, share)
+    if part == "source":
+        source, used = cut(source, kept)
+        truth, seen = truth[used], seen[used]
+    else:
+        target, _ = cut(target, kept)
+    result = dine.register(source, target)
+    assert mean_error(result.moved.vertices[seen], truth[seen]) < 0.03
+    assert result.report["overlap_found"] == "both"
 
 
 def test_a_source_that_is_a_part_of_its_target(pair):
@@ -455,18 +485,69 @@ def only_faces(surface, keep):
     return Surface(surface.vertices[used], index.reshape(-1, 3))
 
 
-@pytest.mark.parametrize(("shown", "taken"), [((0.9, 0.5), True), ((0.9, 0.3), False)])
-def test_auto_takes_scans_for_parts_only_if_they_overlap(shown, taken, monkeypatch):
+@pytest.fixture
+def looks(monkeypatch):
+    """What is found where is said by a function of ``far``, how far an alignment shifts the source,
+    of the detail, and of whether something was known before."""
+    here = organ().vertices[::50]
+
+    def use(said, shifts):
+        def pair(far):
+            shift = np.eye(4)
+            shift[0, 3] = far
+            alignment = Alignment.of(here, shift)
+            there = alignment.frame.normalise(here)
+            return Pair(organ(), organ(), alignment, here, alignment.normalise(here), there)
+
+        def correspond(pair, model, settings, detail=FULL, before=None):
+            far = pair.alignment.matrix[0, 3]
+            end = said(far, detail is FULL, settings.overlap is Overlap.BOTH)
+            still = np.zeros_like(pair.start)
+            found = Correspondence(pair.start, pair.goal, still, None, np.ones(len(still), bool))
+            return dataclasses.replace(
+                found, anywhere=np.zeros_like, improbability=end[0], shown=end[1], unmet=0.2
+            )
+
+        def aligned(source, target, settings, convention):
+            parts = settings.overlap is Overlap.BOTH
+            return [pair(far) for far in (shifts if parts else shifts[:1])]
+
+        monkeypatch.setattr(overlap, "aligned_pairs", aligned)
+        monkeypatch.setattr(overlap, "correspond", correspond)
+        settings = Settings("auto", 40, Overlap.AUTO, 1024, 0, None, True, None)
+        model = Model(None, Path(), {})
+        found, correspondence = overlap.correspondence_of(organ(), organ(), model, settings)
+        return float(found.alignment.matrix[0, 3]), correspondence
+
+    return use
+
+
+MOST = (0.8, 0.8)
+
+
+def test_auto_takes_scans_for_parts_where_that_is_more_probable(looks):
+    chosen, found = looks(lambda far, *_: (1000.0 - 300 * far, MOST), [0.0, 1.0])
+    assert (chosen, found.overlap, found.rival) == (1.0, Overlap.BOTH, False)
+
+
+def test_auto_keeps_wholes_that_another_alignment_is_hardly_better_than(looks):
+    chosen, found = looks(lambda far, *_: (1000.0 - 30 * far, MOST), [0.0, 1.0])
+    assert (chosen, found.overlap, found.rival) == (0.0, Overlap.AUTO, True)
+
+
+def test_auto_takes_scans_for_parts_only_if_what_both_show_is_about_as_large(looks):
     """Any whole can be bent so that it lies within some of another."""
-    point = np.zeros((1, 3))
-    whole = Correspondence(point, point, point, None, np.ones(1, bool), unmet=0.2)
-    parts = dataclasses.replace(whole, unmet=0.0, shown=shown)
-    found = {Overlap.AUTO: whole, Overlap.BOTH: parts}
-    monkeypatch.setattr(correspondence, "aligned_pairs", lambda *_: [])
-    monkeypatch.setattr(
-        correspondence, "_most_probable", lambda pairs, model, how: (None, found[how.overlap])
-    )
-    settings = Settings("auto", 40, Overlap.AUTO, 1024, 0, None, True, None)
-    _, chosen = correspondence.correspondence_of(organ(), organ(), dine.load_model(), settings)
-    assert (chosen.overlap is Overlap.BOTH) == taken
-    assert chosen.unmet == (0.0 if taken else 0.2)
+
+    def said(far, full, parts):
+        return (1000.0 - 300 * far, (0.9, 0.3) if far else MOST)
+
+    chosen, found = looks(said, [0.0, 1.0])
+    assert (chosen, found.overlap, found.rival) == (0.0, Overlap.AUTO, False)
+
+
+def test_an_alignment_that_only_looks_better_is_not_taken(looks):
+    def said(far, full, parts):
+        return (1000.0 + (300 if full else -300) * far, MOST)
+
+    chosen, found = looks(said, [0.0, 1.0])
+    assert (chosen, found.overlap, found.rival) == (0.0, Overlap.AUTO, False)
