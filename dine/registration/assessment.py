@@ -9,6 +9,7 @@ import numpy as np
 
 from dine.geometry.distance import spacings, surface_distance
 from dine.geometry.interpolation import FittedValues
+from dine.geometry.oriented import evenly
 from dine.geometry.rigid import Alignment, rigid_alignments, transformed
 from dine.geometry.surface import Surface
 from dine.registration.calibration import Calibration, field_values
@@ -48,6 +49,8 @@ _MIRROR_FITS = 0.85
 # At how many times the mean distance of rigidly aligned points it is looked at more closely: what
 # is nearly symmetric aligns as well either way, and tells only when it is bent.
 _MIRROR_NEARER = 1.1
+# Points by which it is aligned.
+_ALIGNED = 500
 _ACROSS = np.array([-1.0, 1.0, 1.0])
 
 MIRRORED = (
@@ -257,7 +260,10 @@ def looks_mirrored(pair: Pair, found: Correspondence, settings: Settings) -> boo
     near = np.linalg.norm(found.field, axis=1).mean() < _LYING_ON
     if near or found.improbability is None or found.overlap is not Overlap.AUTO:
         return False
-    places, seen = pair.places, pair.alignment.restore(pair.goal)
+    # Stiff fields make up for what fewer points tell less of the alignment.
+    places, seen = (
+        x[evenly(x, _ALIGNED)] for x in (pair.places, pair.alignment.restore(pair.goal))
+    )
     nearest = _MIRROR_NEARER * _apart(pair.alignment.align(places), seen)
     image = mirrored(pair.source)
     otherwise = [

@@ -36,15 +36,16 @@ _PAST_THE_RIM, _PAST_THE_END = (0.015, 0.0), (0.03, 0.02)
 # much −log of the evidence may then be more, at a quick look, than of another alignment.
 _LITTLE = 0.01
 _HARDLY_WORSE = 10.0
-# Alignments that are carried to the end: the first, and others that a quick look finds about as
-# probable as the likeliest and farther than so many radii from those. By how much −log of the
-# evidence may be more for that, and by how much less a later one's must be in the end.
+# Alignments that are carried to the end, and the share of a scan that the other shows from which it
+# lies within that. By how much −log of the evidence may be more than the likeliest's for that, how
+# many radii these are apart, and by how much less a later one's must be in the end.
 _CARRIED = 3
+_WITHIN = 0.96
 _ABOUT_AS_GOOD = 40.0
 _ALIKE = 0.1
 _BETTER = 50.0
 # What both show is not likely so many times larger on one.
-_STRETCHED = 2.5
+_STRETCHED = 4.0
 # Points by whose distances areas are compared.
 _SPREAD = 200
 # Mean distance between fields that are the same but for details.
@@ -250,15 +251,18 @@ def _extent(points: np.ndarray) -> float:
 
 
 def _worth_more(looks: Sequence[_Look], first: bool) -> list[Pair]:
-    """Alignments to be carried to the end: the ``first``, and those that are about as probable as
-    the likeliest."""
-    likeliest = min(looks, key=_unlikely)
+    """Alignments to be carried to the end: the ``first``, the likeliest, the likeliest by which
+    neither scan lies within the other, and those that are about as probable as the likeliest.
+
+    Few points say little against a part that is bent so that it lies within another.
+    """
     ranked = sorted(looks, key=_unlikely)
+    overlapping = [look for look in ranked if max(look.found.shown) < _WITHIN]
+    close = [look for look in ranked if _unlikely(look, _ABOUT_AS_GOOD) <= _unlikely(ranked[0])]
     kept, fields = [], []
-    for look in [looks[0], *ranked] if first else ranked:
-        worth = not kept or _unlikely(look, _ABOUT_AS_GOOD) <= _unlikely(likeliest)
+    for look in [*looks[: int(first)], ranked[0], *overlapping[:1], *close]:
         moved = _moved(look.pair, look.found, looks[0].pair)
-        if worth and all(_apart(moved, other) > _ALIKE for other in fields):
+        if all(_apart(moved, other) > _ALIKE for other in fields):
             kept.append(look.pair)
             fields.append(moved)
     return kept[: _CARRIED if first else _CARRIED - 1]

@@ -223,13 +223,9 @@ def improbabilities(pairs: Sequence[Pair], settings: Settings, detail: Detail) -
     """How little each of several alignments of two scans explains: −log of the evidence, up to a
     constant, of the surfaces and a field that hardly bends, on few points."""
     rng = np.random.default_rng([8, settings.seed])
-    source, target = (
-        drawn.at(evenly(drawn.points, count))
-        for drawn, count in (
-            (oriented_points(pairs[0].source, _DRAWN * detail.source, rng), detail.source),
-            (oriented_points(pairs[0].target, _DRAWN * detail.target, rng), detail.target),
-        )
-    )
+    source = oriented_points(pairs[0].source, _DRAWN * detail.source, rng)
+    source = source.at(evenly(source.points, detail.source))
+    target = oriented_points(pairs[0].target, detail.target, rng)
     none = Curve(np.zeros((0, 3)), np.zeros((0, 3)))
     options = _rough(_options(settings.overlap, detail), _ROUGHLY[0][1], detail.rounds, detail.last)
     found = []

@@ -211,3 +211,17 @@ def test_the_scale_is_found_again():
     posterior = Posterior(LinearGaussian.of_kernel(root), 1e8 * drawn, precision)
     assert posterior.scale == pytest.approx(0.2, rel=0.25)
     assert 0 < posterior.determined <= 3 * root.shape[1]
+
+
+@pytest.mark.parametrize("drawn_with", [0.05, 0.3])
+def test_a_scale_that_is_not_known_saves_what_it_adds_to_the_evidence(drawn_with):
+    root = covariance_root(cloud(400), WIDTHS, AMPLITUDES, AFFINE).root
+    prior = LinearGaussian.of_kernel(root)
+    drawn = drawn_with * root @ np.random.default_rng(6).normal(size=(root.shape[1], 3))
+    posterior = Posterior(prior, 1e10 * drawn, np.tile(1e10 * np.eye(3), (400, 1, 1)))
+    scale = max(posterior.scale, 0.1)
+    more = posterior.under(prior.times(scale)).evidence - posterior.evidence
+    assert posterior.saving(0.1) == pytest.approx(more, rel=0.05)
+    assert more > 100
+    # A scale above the given one is not asked for.
+    assert posterior.under(prior.times(scale / 2)).saving(0.1) == pytest.approx(0, abs=1e-9)
