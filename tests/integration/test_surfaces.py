@@ -539,7 +539,7 @@ def test_auto_takes_scans_for_parts_only_if_what_both_show_is_about_as_large(loo
     """Any whole can be bent so that it lies within some of another."""
 
     def said(far, full, parts):
-        return (1000.0 - 300 * far, (0.9, 0.3) if far else MOST)
+        return (1000.0 - 300 * far, (0.9, 0.2) if far else MOST)
 
     chosen, found = looks(said, [0.0, 1.0])
     assert (chosen, found.overlap, found.rival) == (0.0, Overlap.AUTO, False)
@@ -551,3 +551,12 @@ def test_an_alignment_that_only_looks_better_is_not_taken(looks):
 
     chosen, found = looks(said, [0.0, 1.0])
     assert (chosen, found.overlap, found.rival) == (0.0, Overlap.AUTO, False)
+
+
+def test_one_by_which_neither_lies_within_the_other_is_carried_on_whatever_looks_better(looks):
+    def said(far, full, parts):
+        within = (1.0, 0.5) if far > 1 else MOST
+        return (1000.0 + (400 if full else -400) * (far > 1) - 100 * (far == 1), within)
+
+    chosen, found = looks(said, [0.0, 1.0, 2.0, 3.0, 4.0])
+    assert (chosen, found.overlap, found.rival) == (1.0, Overlap.BOTH, False)
