@@ -220,7 +220,18 @@ def _of_parts(
     rival = any(_rivals(end, best) for end in ends)
     if whole and (best.stretched or _same(*whole, best)):
         return whole[0], replace(whole[1], rival=rival)
-    return best.pair, replace(best.found, overlap=settings.overlap, rival=rival)
+    least = min(one.found.improbability for one in quick)
+    return best.pair, replace(best.found, overlap=settings.overlap, rival=rival, at_a_look=least)
+
+
+def at_a_look(source: Surface, target: Surface, model: Model, settings: Settings) -> float:
+    """The least −log of the evidence that quick looks at two scans as parts find, with no more than
+    their rigid alignments to start from."""
+    settings = replace(settings, overlap=Overlap.BOTH)
+    pairs = aligned_pairs(source, target, settings, model.convention)
+    found = each(lambda pair: correspond(pair, model, settings, QUICK), pairs)
+    known = (one.improbability for one in found if one.improbability is not None)
+    return min(known, default=np.inf)
 
 
 def _stays(pair: Pair, whole: Correspondence, looks: Sequence[_Look]) -> bool:

@@ -205,7 +205,7 @@ def _registered(
     motion = Motion(pair.alignment, correspondence.interpolated())
     calibration = model.calibration_for(settings, correspondence.overlap)
     mirrored, (moved, expected, measures) = together(
-        lambda: looks_mirrored(pair, correspondence, settings),
+        lambda: looks_mirrored(pair, correspondence, model, settings),
         lambda: _measured(pair, correspondence, motion, model, settings),
     )
     if mirrored:

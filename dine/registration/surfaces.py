@@ -45,7 +45,7 @@ _COARSE_ERROR = 0.01
 # Where scans overlap: what points beyond the other's end cost, against others without counterpart;
 # how stiff fields are found, each from the one before; and how the search goes on from these.
 _MISSING = 0.06
-_ROUGHLY = ((STIFFER, 0.2, 15), (STIFF_AND_BENT, 0.15, 10))
+_ROUGHLY = ((STIFFER, 0.35, 20), (STIFF_AND_BENT, 0.15, 10))
 _ROUGH_END = 0.05
 _GOING_ON = (0.08, 0.04)
 # Points through which a plane is laid to see how rough a mesh is, and the cosine between planes and

@@ -195,6 +195,7 @@ class Correspondence:
         overlap: as which the scans were registered, ``both`` where ``auto`` found that parts are
             missing.
         rival: whether another way to lay parts on each other is about as probable.
+        at_a_look: the least −log of the evidence that quick looks at parts found; None of wholes.
     """
 
     start: np.ndarray
@@ -209,6 +210,7 @@ class Correspondence:
     shown: tuple[float, float] = (1.0, 1.0)
     overlap: Overlap = Overlap.AUTO
     rival: bool = False
+    at_a_look: float | None = None
 
     def interpolated(self) -> Callable[[np.ndarray], np.ndarray]:
         """The field as a function of (M, 3) places, normalised frame."""

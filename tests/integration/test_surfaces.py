@@ -138,7 +138,6 @@ def test_parts_that_overlap_come_to_lie_on_each_other(overlapping, overlap):
     # Without a rigid alignment the field itself turns, more than any that was validated on.
     assert result.trust.verdict == ("plausible" if overlap == "auto" else "doubtful")
     assert ("registered as parts" in " ".join(result.trust.reasons)) == (overlap == "auto")
-    # Whether a whole is mirrored is not to be told from what only one of them shows.
     assert "mirror image" not in " ".join(result.trust.reasons)
 
 
@@ -452,6 +451,12 @@ def test_a_mirror_image_is_told_of_what_is_nearly_symmetric(flipped):
     target = Surface(bent(source.vertices), source.faces)
     result = dine.register(source, mirrored(target) if flipped else target)
     assert any("mirror image" in reason for reason in result.trust.reasons) == flipped
+
+
+def test_a_mirror_image_is_told_of_parts(overlapping):
+    source, target, _, _ = overlapping
+    reasons = " ".join(dine.register(source, mirrored(target), overlap="both").trust.reasons)
+    assert "mirror image" in reasons
 
 
 def test_a_symmetric_object_is_no_mirror_image_of_itself():
