@@ -262,11 +262,18 @@ def looks_mirrored(pair: Pair, found: Correspondence, model: Model, settings: Se
     near = np.linalg.norm(found.field, axis=1).mean() < _LYING_ON
     if near or found.improbability is None:
         return False
+    whole = found.overlap is Overlap.AUTO
+    if whole and not _mirrored_whole(pair, settings):
+        return False
+    # As wholes, parts fit as badly one way as the other, and a little better either way.
     if found.at_a_look is not None:
         image = at_a_look(mirrored(pair.source), pair.target, model, settings)
         return image < _MIRROR_FITS * found.at_a_look
-    if found.overlap is not Overlap.AUTO:
-        return False
+    return whole
+
+
+def _mirrored_whole(pair: Pair, settings: Settings) -> bool:
+    """The same of two scans that show the same."""
     # Stiff fields make up for what fewer points tell less of the alignment.
     places, seen = (
         x[evenly(x, _ALIGNED)] for x in (pair.places, pair.alignment.restore(pair.goal))

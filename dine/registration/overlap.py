@@ -210,8 +210,9 @@ def _of_parts(
     for one in quick:
         if one.found.improbability is None:  # the same points, which leave nothing open
             return one.pair, replace(one.found, overlap=settings.overlap)
+    least = min(one.found.improbability for one in quick)
     if whole and _stays(*whole, quick):
-        return whole
+        return whole[0], replace(whole[1], at_a_look=least)
     others = _worth_more(quick[len(known) :], first=not known)
     ends = each(lambda one: look(*one, FULL), [*known, *((pair, None) for pair in others)])
     best = min(ends, key=_unlikely)
@@ -219,8 +220,7 @@ def _of_parts(
         best = ends[0]
     rival = any(_rivals(end, best) for end in ends)
     if whole and (best.stretched or _same(*whole, best)):
-        return whole[0], replace(whole[1], rival=rival)
-    least = min(one.found.improbability for one in quick)
+        return whole[0], replace(whole[1], rival=rival, at_a_look=least)
     return best.pair, replace(best.found, overlap=settings.overlap, rival=rival, at_a_look=least)
 
 

@@ -195,7 +195,8 @@ class Correspondence:
         overlap: as which the scans were registered, ``both`` where ``auto`` found that parts are
             missing.
         rival: whether another way to lay parts on each other is about as probable.
-        at_a_look: the least −log of the evidence that quick looks at parts found; None of wholes.
+        at_a_look: the least −log of the evidence that quick looks at the scans as parts found; None
+            where none were needed.
     """
 
     start: np.ndarray
