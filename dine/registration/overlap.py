@@ -195,8 +195,8 @@ def _of_parts(
     unless another is clearly more probable.
 
     Args:
-        whole: what was found of the scans as wholes, which comes first, goes on as parts, and is
-            given back where that changes nothing.
+        whole: what was found of the scans as wholes, which goes on as parts, counts as much as the
+            first, and is given back where that changes nothing.
     """
     known = [whole] if whole else []
     larger = _extent(pairs[0].goal) / _extent(pairs[0].start)
@@ -213,11 +213,14 @@ def _of_parts(
     least = min(one.found.improbability for one in quick)
     if whole and _stays(*whole, quick):
         return whole[0], replace(whole[1], at_a_look=least)
-    others = _worth_more(quick[len(known) :], first=not known)
-    ends = each(lambda one: look(*one, FULL), [*known, *((pair, None) for pair in others)])
-    best = min(ends, key=_unlikely)
-    if _unlikely(best) >= _unlikely(ends[0], _BETTER):
-        best = ends[0]
+    carried = [*known, *((pair, None) for pair in _worth_more(quick[len(known) :]))]
+    ends = each(lambda one: look(*one, FULL), carried)
+    # Where the files lay the scans, and where they were found as wholes, has more for it.
+    usual = len(known) + 1
+    best = min(ends[:usual], key=_unlikely)
+    other = min(ends[usual:], key=_unlikely, default=best)
+    if _unlikely(other) < _unlikely(best, _BETTER):
+        best = other
     rival = any(_rivals(end, best) for end in ends)
     if whole and (best.stretched or _same(*whole, best)):
         return whole[0], replace(whole[1], rival=rival, at_a_look=least)
@@ -261,9 +264,9 @@ def _extent(points: np.ndarray) -> float:
     return float(np.median(spacings(some)) ** 2)
 
 
-def _worth_more(looks: Sequence[_Look], first: bool) -> list[Pair]:
-    """Alignments to be carried to the end: the ``first``, the likeliest, the likeliest by which
-    neither scan lies within the other, and those that are about as probable as the likeliest.
+def _worth_more(looks: Sequence[_Look]) -> list[Pair]:
+    """Alignments to be carried to the end: the first, the likeliest, the likeliest by which neither
+    scan lies within the other, and those that are about as probable as the likeliest.
 
     Few points say little against a part that is bent so that it lies within another.
     """
@@ -271,12 +274,12 @@ def _worth_more(looks: Sequence[_Look], first: bool) -> list[Pair]:
     overlapping = [look for look in ranked if max(look.found.shown) < _WITHIN]
     close = [look for look in ranked if _unlikely(look, _ABOUT_AS_GOOD) <= _unlikely(ranked[0])]
     kept, fields = [], []
-    for look in [*looks[: int(first)], ranked[0], *overlapping[:1], *close]:
+    for look in [looks[0], ranked[0], *overlapping[:1], *close]:
         moved = _moved(look.pair, look.found, looks[0].pair)
         if all(_apart(moved, other) > _ALIKE for other in fields):
             kept.append(look.pair)
             fields.append(moved)
-    return kept[: _CARRIED if first else _CARRIED - 1]
+    return kept[:_CARRIED]
 
 
 def _moved(pair: Pair, found: Correspondence, at: Pair) -> np.ndarray:
